@@ -11,7 +11,7 @@ restarted shard from its clients for a fifth longer (55 ms of processor time, me
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from enact_dist.core.datum import Position
+from enact_dist.core.protocol.datum import Position
 from enact_dist.terms import (
     NULL,
     Aspect,
@@ -30,19 +30,19 @@ from enact_dist.terms import (
 )
 
 if TYPE_CHECKING:
-    from enact_dist.actor import Actor
-    from enact_dist.actor_runner import run_actor
-    from enact_dist.cell import Cell
+    from enact_dist.access.lock import Lock
+    from enact_dist.access.snapshot import Snapshot
+    from enact_dist.access.together import Together
+    from enact_dist.access.watch import Change, Watch
+    from enact_dist.actor.actor import Actor
+    from enact_dist.actor.running.runner import run_actor
     from enact_dist.comparing import Difference, Tolerance
-    from enact_dist.connecting import connect, local
-    from enact_dist.history import Version
-    from enact_dist.lock import Lock
-    from enact_dist.past_context import PastContext
-    from enact_dist.snapshot import Snapshot
-    from enact_dist.together import Together
-    from enact_dist.watch import Change, Watch
     from enact_dist.wire.codecs import register_codec
-    from enact_dist.world import WorldContext
+    from enact_dist.world.cell import Cell
+    from enact_dist.world.connecting import connect, local
+    from enact_dist.world.context import WorldContext
+    from enact_dist.world.history import Version
+    from enact_dist.world.past import PastContext
 
 __all__ = [
     "NULL",
@@ -79,22 +79,22 @@ __all__ = [
 ]
 
 _HOME_OF = {
-    "Actor": "actor",
-    "Cell": "cell",
-    "Change": "watch",
+    "Actor": "actor.actor",
+    "Cell": "world.cell",
+    "Change": "access.watch",
     "Difference": "comparing",
-    "Lock": "lock",
-    "PastContext": "past_context",
-    "Snapshot": "snapshot",
-    "Together": "together",
+    "Lock": "access.lock",
+    "PastContext": "world.past",
+    "Snapshot": "access.snapshot",
+    "Together": "access.together",
     "Tolerance": "comparing",
-    "Version": "history",
-    "Watch": "watch",
-    "WorldContext": "world",
-    "connect": "connecting",
-    "local": "connecting",
+    "Version": "world.history",
+    "Watch": "access.watch",
+    "WorldContext": "world.context",
+    "connect": "world.connecting",
+    "local": "world.connecting",
     "register_codec": "wire.codecs",
-    "run_actor": "actor_runner",
+    "run_actor": "actor.running.runner",
 }
 
 

@@ -21,23 +21,23 @@ import contextlib
 from typing import TYPE_CHECKING, Final
 from weakref import WeakKeyDictionary
 
-from enact_dist.actor import name_of
-from enact_dist.actor_binding import BoundActor
-from enact_dist.actor_doing import Doing
-from enact_dist.actor_once import Once
-from enact_dist.actor_triggers import PendingTriggers, tick_before
-from enact_dist.connecting import local
+from enact_dist.access.session import session_of
+from enact_dist.access.together import captured_versions
+from enact_dist.actor.actor import name_of
+from enact_dist.actor.binding import BoundActor
+from enact_dist.actor.once import Once
+from enact_dist.actor.running.doing import Doing
+from enact_dist.actor.triggers import PendingTriggers, tick_before
 from enact_dist.link.clock import monotonic_ns, wall_ns
-from enact_dist.session import session_of
-from enact_dist.together import captured_versions
+from enact_dist.world.connecting import local
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-    from enact_dist.actor import Actor
-    from enact_dist.actor_sets import IncompleteSet, PendingSets
-    from enact_dist.cell import Cell
+    from enact_dist.actor.actor import Actor
+    from enact_dist.actor.sets import IncompleteSet, PendingSets
     from enact_dist.terms import Entity
+    from enact_dist.world.cell import Cell
 
 
 STEP_NS: Final = 100_000_000

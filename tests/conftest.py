@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
-from enact_dist import lock
+from enact_dist.access import lock
 
 sys.path.insert(0, str(Path(__file__).parent))
 import carriers

@@ -44,8 +44,8 @@ def test_every_error_stands_in_the_drawn_tree():
 def test_daemon_starts_without_the_clients_half():
     """A restarted shard serves the sooner: no locks, no actors, no demo are loaded for it."""
     code = (
-        "import sys, enact_dist.cli.main, enact_dist.link.shard_daemon, enact_dist.link.store\n"
-        "print(*{'enact_dist.lock', 'enact_dist.actor', 'enact_dist.cell'} & set(sys.modules))"
+        "import sys, enact_dist.cli.main, enact_dist.link.daemon.daemon, enact_dist.link.store.store\n"
+        "print(*{'enact_dist.access.lock', 'enact_dist.actor.actor', 'enact_dist.world.cell'} & set(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
 

@@ -47,7 +47,7 @@ from actors.palletizing.vocabulary import (
 )
 from actors.workcell.vocabulary import JOINTS
 from enact_dist import Actor, Entity, View, ViewEach, World, Write
-from enact_dist.actor_binding import joined
+from enact_dist.actor.binding import joined
 
 if TYPE_CHECKING:
     import numpy as np

@@ -16,6 +16,7 @@ from actors.palletizing.vocabulary import (
     EMPTY,
     GRASP,
     NET,
+    OUTCOME,
     PLACES,
     PLAN,
     PLANNED,

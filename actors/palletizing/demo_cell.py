@@ -9,7 +9,7 @@ from urllib.parse import parse_qsl
 
 from actors import running_cell
 from actors.running_cell import DemoCell, placed, toml_of
-from enact_dist.config import load_config
+from enact_dist.config.read import load_config
 from enact_dist.errors import ConfigError
 
 if TYPE_CHECKING:

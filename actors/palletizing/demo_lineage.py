@@ -20,8 +20,8 @@ from actors.palletizing.vocabulary import (
     view_entity,
 )
 from enact_dist import Entity, View
-from enact_dist.cli.lineage import drawn
-from enact_dist.cli.output import print_tree
+from enact_dist.cli.text.output import print_tree
+from enact_dist.cli.world.lineage import drawn
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from enact_dist import Cell
-    from enact_dist.lineage import CauseTree, EffectTree
+    from enact_dist.world.lineage import CauseTree, EffectTree
 
 CAUSES_DEPTH: Final = 2
 """From the verdict over its depth frame and the model to the views."""

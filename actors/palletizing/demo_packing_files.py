@@ -24,10 +24,10 @@ from actors.palletizing.vocabulary import (
     TRAY,
 )
 from enact_dist import View, ViewEach
-from enact_dist.actor_check import declarations_of
-from enact_dist.actor_graph import graph_of
-from enact_dist.actor_graph_svg import svg_of
-from enact_dist.config import load_config
+from enact_dist.actor.check import declarations_of
+from enact_dist.actor.drawing.graph import graph_of
+from enact_dist.actor.drawing.svg import svg_of
+from enact_dist.config.read import load_config
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, Self
 from actors import running_cell
 from actors.palletizing.simulation.remote_cell import RemoteCell
 from actors.running_cell import DemoCell, DemoError, placed, toml_of
-from enact_dist.config import load_config
+from enact_dist.config.read import load_config
 from enact_dist.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -21,9 +21,10 @@ from enact_dist.errors import EnactError
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from actors.palletizing.vocabulary import Deviation, Plan, Request
-    from enact_dist import Cell
-    from enact_dist.actor_binding import Joined
+    from actors.palletizing.handling import Known
+    from actors.palletizing.vocabulary import Deviation, Request
+    from enact_dist import Cell, WorldContext
+    from enact_dist.actor.binding import Joined
 
 _LOG: Final = logging.getLogger("enact.actor")
 PREFIX: Final = "expected-"

@@ -8,21 +8,24 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from actors.palletizing.handling import (
+    FELT_SIDE,
     GONE,
     IDLE,
     NOT_ASIDE,
     STANDS,
+    TAKEN_OUT,
     UNRECOGNISED,
     along_and_across,
+    felt_on,
     is_current,
     is_held,
 )
 from actors.palletizing.reactions import (
     BY_ITSELF,
     CANNOT,
-    FELT_M,
     MOST,
     NO_NET,
+    UNFIT_ON_BELT,
     Case,
     Reaction,
     choices_of,

@@ -55,7 +55,7 @@ from actors.palletizing.handling_data import Result as Result  # noqa: PLC0414
 from actors.palletizing.handling_data import Sight as Sight  # noqa: PLC0414
 from actors.palletizing.nets import Execution
 from enact_dist import Aspect, Durability, Entities, Entity, Retention, Tolerance
-from enact_dist.outcome import Outcome as NetOutcome
+from enact_dist.actor.outcome import Outcome as NetOutcome
 
 PRODUCTS: Final = Entities("product/*")
 VIEWS: Final = Entities("view/*/*")

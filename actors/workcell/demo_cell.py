@@ -12,9 +12,9 @@ from actors.geometry.files import write_whole
 from actors.running_cell import DemoCell, placed, toml_of
 from actors.workcell.demo_options import Options
 from enact_dist import local
-from enact_dist.actor_load import configured_actor
-from enact_dist.actor_process import ActorThread
-from enact_dist.config import load_config
+from enact_dist.actor.running.load import configured_actor
+from enact_dist.actor.running.process import ActorThread
+from enact_dist.config.read import load_config
 from enact_dist.errors import ConfigError
 
 if TYPE_CHECKING:

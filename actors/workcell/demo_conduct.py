@@ -22,8 +22,8 @@ from actors.workcell.demo_cell import SETUP
 from actors.workcell.scenarios import scenario_of
 from actors.workcell.trace import ONLINE, RECORDED, TRUTH
 from enact_dist import Lock, View, ViewEach, Write
-from enact_dist.actor_words import reports_of, tell_reported
-from enact_dist.config import load_config
+from enact_dist.actor.running.words import reports_of, tell_reported
+from enact_dist.config.read import load_config
 from enact_dist.errors import EnactError, ForgottenError, NullDatumError, ShardUnreachableError
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from actors.workcell.demo_options import Options
     from actors.workcell.scenarios import Fault
     from enact_dist import Aspect, Cell, Entity, Version
-    from enact_dist.lineage import CauseTree
+    from enact_dist.world.lineage import CauseTree
 
     Image = npt.NDArray[np.uint8]
 

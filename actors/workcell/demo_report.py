@@ -11,8 +11,8 @@ from actors.workcell.demo_conduct import DEPTH, masks_of
 from actors.workcell.evaluation import GOALS, missed
 from actors.workcell.trace import ONLINE
 from enact_dist import View
-from enact_dist.cli.lineage import drawn
-from enact_dist.cli.output import print_tree
+from enact_dist.cli.text.output import print_tree
+from enact_dist.cli.world.lineage import drawn
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from actors.workcell.demo_conduct import Notes
     from enact_dist import Aspect, Cell, Entity
-    from enact_dist.lineage import CauseTree
+    from enact_dist.world.lineage import CauseTree
 
 T = TypeVar("T")
 

@@ -12,7 +12,7 @@ from actors.workcell.motion import BRAKING_M_S2, CYCLE_S, NOMINAL_M_S
 from actors.workcell.planning import PathPlanning
 from actors.workcell.trace import ONLINE
 from enact_dist import View
-from enact_dist.actor_process import ActorThread
+from enact_dist.actor.running.process import ActorThread
 from enact_dist.errors import EnactError
 from enact_dist.recording import Replay
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
-    from enact_dist.core.datum import Datum
+    from enact_dist.core.protocol.datum import Datum
 T = TypeVar("T")
 
 ONLINE: Final = "online"

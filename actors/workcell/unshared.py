@@ -17,9 +17,9 @@ from actors.running_cell import toml_of
 from actors.workcell import vocabulary as words
 from actors.workcell.demo_cell import TEMPLATE, configured
 from enact_dist import Entity
-from enact_dist.actor_load import configured_actor
-from enact_dist.config import load_config
-from enact_dist.together import Together
+from enact_dist.access.together import Together
+from enact_dist.actor.running.load import configured_actor
+from enact_dist.config.read import load_config
 
 if TYPE_CHECKING:
     from actors.workcell.demo_options import Options

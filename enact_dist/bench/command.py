@@ -30,10 +30,10 @@ from enact_dist.bench.updates import run_durable, run_multi, run_update, run_wai
 from enact_dist.bench.visit import PEAK_BYTES, without_room
 from enact_dist.bench.workcell import run_workcell
 from enact_dist.cli.bench import BENCHES as TOLD
-from enact_dist.cli.output import print_json, print_table
+from enact_dist.cli.text.output import print_json, print_table
 from enact_dist.cli.verbs import DONE, FAILED
 from enact_dist.errors import EnactError, MisuseError
-from enact_dist.link.shared_folder import MEMORY
+from enact_dist.link.memory.shared_folder import MEMORY
 
 if TYPE_CHECKING:
     import argparse

@@ -12,8 +12,8 @@ from enact_dist.bench.floors import QUERY
 from enact_dist.bench.place import WORLD
 from enact_dist.bench.rows import Case, Goal, at_most
 from enact_dist.bench.timing import COUNT_MAX, timed
-from enact_dist.core.datum import Datum, LockId, Slot, Token
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.datum import Datum, LockId, Slot, Token
+from enact_dist.core.protocol.messages import (
     Acquire,
     AspectEntry,
     Commit,
@@ -26,9 +26,9 @@ from enact_dist.core.messages import (
     ShardEntry,
     WriteItem,
 )
-from enact_dist.core.records import Persist, Persisted, Recovered, Reply
-from enact_dist.core.shard import Shard
-from enact_dist.core.shard_state import ShardSettings
+from enact_dist.core.protocol.records import Persist, Persisted, Recovered, Reply
+from enact_dist.core.shard.shard import Shard
+from enact_dist.core.shard.state import ShardSettings
 from enact_dist.errors import MisuseError
 from enact_dist.terms import Access
 

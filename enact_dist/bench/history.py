@@ -15,24 +15,24 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from enact_dist.access.lock import Lock
 from enact_dist.bench.place import EMBEDDED, WORLD, Place, environment, fresh_place
 from enact_dist.bench.rows import Case, Goal, Key, times, value_row
 from enact_dist.bench.timing import timed
 from enact_dist.bench.updates import WAIT_S, floor_of, update
 from enact_dist.bench.usage import Usage
 from enact_dist.errors import UnknownWorldError
-from enact_dist.forking import drop_world
-from enact_dist.lock import Lock
 from enact_dist.retention import Retention
 from enact_dist.terms import Aspect, Durability, Entity, View, Write
+from enact_dist.world.forks import drop_world
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
     from enact_dist.bench.run import Run
-    from enact_dist.core.datum import Position
-    from enact_dist.world import WorldContext
+    from enact_dist.core.protocol.datum import Position
+    from enact_dist.world.context import WorldContext
 
     Measure = Callable[[float], Sequence[float]]
 

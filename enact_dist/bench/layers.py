@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from enact_dist import reading
+from enact_dist.access import reads as reading
 from enact_dist.bench import payloads
 from enact_dist.bench.floors import PAUSED, SIZES, mapped, reply
 from enact_dist.bench.payloads import ARRAY, LARGEST, SMALL, WAIT_S, Storer, entity, fetch, floats
@@ -29,10 +29,10 @@ from enact_dist.bench.rows import Case
 from enact_dist.bench.run import ROUNDS
 from enact_dist.bench.timing import COUNT_MAX, PAUSE_S, timed
 from enact_dist.bench.updates import floor_of, slots, update
-from enact_dist.core.shard import Shard
+from enact_dist.core.shard.shard import Shard
 from enact_dist.errors import LinkError
-from enact_dist.link.client import CellClient
-from enact_dist.link.embedded import EmbeddedCarrier
+from enact_dist.link.client.locks import CellClient
+from enact_dist.link.daemon.embedded import EmbeddedCarrier
 from enact_dist.wire.frames import decode_frame, encode_frame
 
 if TYPE_CHECKING:
@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 
     from enact_dist.bench.rows import Key
     from enact_dist.bench.run import Run
-    from enact_dist.core.messages import Message
-    from enact_dist.world import WorldContext
+    from enact_dist.core.protocol.messages import Message
+    from enact_dist.world.context import WorldContext
 
 NAME: Final = "layers"
 LOCK: Final = "lock and its data"

@@ -8,10 +8,10 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.access.lock import Lock
 from enact_dist.bench.place import fresh_place
 from enact_dist.bench.rows import Row, value_row
 from enact_dist.bench.usage import private_bytes, slope
-from enact_dist.lock import Lock
 from enact_dist.terms import Aspect, Durability, Entity, Write
 
 if TYPE_CHECKING:

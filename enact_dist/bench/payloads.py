@@ -19,12 +19,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from enact_dist.access.lock import Lock
 from enact_dist.bench.floors import SIZES, mapped, reply, written
 from enact_dist.bench.place import EMBEDDED
 from enact_dist.bench.rows import Case, Key, at_most, times
 from enact_dist.bench.timing import timed
 from enact_dist.bench.updates import floor_of
-from enact_dist.lock import Lock
 from enact_dist.terms import Aspect, Durability, Entity, Read, Write
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
     from enact_dist.bench.run import Run
     from enact_dist.verify.daemons import LineProcess
-    from enact_dist.world import WorldContext
+    from enact_dist.world.context import WorldContext
 
 SMALL: Final = "1 kB"
 LARGEST: Final = "100 MB"

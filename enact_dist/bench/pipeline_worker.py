@@ -23,21 +23,21 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from enact_dist.actor import Actor
-from enact_dist.actor_runner import ActorRun
+from enact_dist.access.lock import Lock
+from enact_dist.access.together import Together
+from enact_dist.actor.actor import Actor
+from enact_dist.actor.running.runner import ActorRun
 from enact_dist.bench.place import WORLD
 from enact_dist.bench.timing import sleep_until
-from enact_dist.connecting import connect
-from enact_dist.lock import Lock
 from enact_dist.terms import Aspect, Durability, Entity, View, World, Write
-from enact_dist.together import Together
+from enact_dist.world.connecting import connect
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
-    from enact_dist.cell import Cell
+    from enact_dist.world.cell import Cell
 
 CAMERAS: Final = 8
 PERIOD_NS: Final = 100_000_000

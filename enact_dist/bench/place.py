@@ -11,17 +11,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.bench.visit import Visit, anywhere
-from enact_dist.config_values import CARRIERS
-from enact_dist.connecting import connect, local
-from enact_dist.link.shared_folder import MEMORY, SHARED_FOLDER_VARIABLE
-from enact_dist.supervise import SUPERVISOR_VARIABLE
+from enact_dist.config.types import CARRIERS
+from enact_dist.link.memory.shared_folder import MEMORY, SHARED_FOLDER_VARIABLE
+from enact_dist.operate.supervise import SUPERVISOR_VARIABLE
 from enact_dist.verify.daemons import KeptPorts, LineProcess
+from enact_dist.world.connecting import connect, local
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from enact_dist.cell import Cell
-    from enact_dist.world import WorldContext
+    from enact_dist.world.cell import Cell
+    from enact_dist.world.context import WorldContext
 
 WORLD: Final = "bench"
 """The world context that all benches write into; made if it does not exist."""

@@ -13,6 +13,7 @@ import threading
 import time
 from typing import TYPE_CHECKING, Any, Final
 
+from enact_dist.access.lock import Lock
 from enact_dist.bench.floors import (
     ECHO,
     ECHO_PAUSED,
@@ -24,14 +25,13 @@ from enact_dist.bench.floors import (
 from enact_dist.bench.place import EMBEDDED
 from enact_dist.bench.rows import Case, Goal, Key, at_most, times
 from enact_dist.bench.timing import PAUSE_S, timed
-from enact_dist.lock import Lock
 from enact_dist.terms import Aspect, Durability, Entity, Read, Write
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from enact_dist.bench.run import Run
-    from enact_dist.world import WorldContext
+    from enact_dist.world.context import WorldContext
 
 FOUR: Final = 4
 WAIT_S: Final = 60.0

@@ -15,13 +15,13 @@ import time
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.errors import EnactError, MisuseError
-from enact_dist.forking import drop_world
+from enact_dist.world.forks import drop_world
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from enact_dist.cell import Cell
-    from enact_dist.cell_info import ShardInfo
+    from enact_dist.world.cell import Cell
+    from enact_dist.world.listings import ShardInfo
 
 PEAK_BYTES: Final = {
     "layers": 60_000_000,

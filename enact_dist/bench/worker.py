@@ -21,20 +21,20 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from enact_dist.access.lock import Lock
 from enact_dist.bench.history import CAMERAS, IMAGE_BYTES, IMAGES, PERIOD_NS, side_of
 from enact_dist.bench.payloads import ARRAY, WAIT_S, said, store
 from enact_dist.bench.place import WORLD
 from enact_dist.bench.timing import sleep_until
 from enact_dist.bench.updates import slots
-from enact_dist.connecting import connect
-from enact_dist.link.datum_cache import DatumCache
-from enact_dist.lock import Lock
+from enact_dist.link.client.fetch import DatumCache
 from enact_dist.terms import Entity, View, Write
+from enact_dist.world.connecting import connect
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from enact_dist.world import WorldContext
+    from enact_dist.world.context import WorldContext
 
 
 def _store(world: WorldContext, _options: dict[str, Any]) -> None:

@@ -8,8 +8,8 @@ import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from enact_dist.cli.verbs import add_verb, seconds, whole
-from enact_dist.config_values import CARRIERS
+from enact_dist.cli.verbs import NOUNS, add_verb, seconds, whole
+from enact_dist.config.types import CARRIERS
 
 if TYPE_CHECKING:
     from enact_dist.cli.verbs import Verb
@@ -95,7 +95,7 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     bench = add_verb(
         nouns,
         "bench",
-        "measure locks, commits and data on this machine, beside the raw floor of the same run",
+        NOUNS["bench"].summary,
         run=run_bench,
         example="enact bench\n"
         "enact bench floor update --json\n"

@@ -23,7 +23,7 @@ _EXTRA: Final = ("open3d", "scipy", "cv2")
 
 def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     """Add the noun and its verbs."""
-    verbs = verbs_of(add_noun(nouns, "demo", "run a demonstration"))
+    verbs = verbs_of(add_noun(nouns, "demo"))
     demo_workcell.add_to(verbs)
     demo = add_verb(
         verbs,

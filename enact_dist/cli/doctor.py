@@ -1,11 +1,11 @@
-"""`enact doctor`: prints what `enact_dist.doctor` found."""
+"""`enact doctor`: prints what `enact_dist.operate.doctor` found."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from enact_dist.cli.output import coloured, print_json
-from enact_dist.cli.verbs import DONE, FAILED, add_reader, add_verb, cell_target
+from enact_dist.cli.text.output import coloured, print_json
+from enact_dist.cli.verbs import DONE, FAILED, NOUNS, add_reader, add_verb, cell_target
 from enact_dist.errors import ConfigError
 from enact_dist.wire.texts import shown
 
@@ -22,8 +22,7 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     doctor = add_verb(
         nouns,
         "doctor",
-        "check this machine, the way to the cell, and whether that runs by its cell.toml:"
-        " libraries, memory, disk, shards, clocks",
+        NOUNS["doctor"].summary,
         run=run_doctor,
         example="enact doctor --cell cell.toml",
     )
@@ -32,7 +31,7 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
 
 def run_doctor(arguments: argparse.Namespace) -> int:
     """Print one line per check; status 1 if one of them failed."""
-    from enact_dist.doctor import Level, examine
+    from enact_dist.operate.doctor import Level, examine
 
     target = _target(arguments)
     findings = []

@@ -9,7 +9,7 @@ import sys
 from datetime import datetime
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.cli.output import print_json, print_table, shown_s
+from enact_dist.cli.text.output import print_json, print_table, shown_s
 from enact_dist.cli.verbs import (
     DONE,
     UNREACHABLE,
@@ -32,11 +32,11 @@ from enact_dist.wire.texts import shown
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from enact_dist.cell import Cell
-    from enact_dist.cell_info import LockInfo
     from enact_dist.cli.verbs import Verb
-    from enact_dist.core.messages import Item
-    from enact_dist.link.client import CellClient
+    from enact_dist.core.protocol.messages import Item
+    from enact_dist.link.client.locks import CellClient
+    from enact_dist.world.cell import Cell
+    from enact_dist.world.listings import LockInfo
 
 POLL_S: Final = 0.05
 """How soon a lost lock or an ended command is noticed."""
@@ -53,7 +53,7 @@ _ACCESSES: Final = {
 
 def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     """Add the noun and its verbs."""
-    verbs = verbs_of(add_noun(nouns, "lock", "look at locks, hold one, break one, resolve one"))
+    verbs = verbs_of(add_noun(nouns, "lock"))
     ls = add_verb(
         verbs,
         "ls",
@@ -287,8 +287,8 @@ def _command_name(arguments: argparse.Namespace) -> str:
 
 def _item(cell: Cell, request: tuple[str, str, str, str], default: str | None) -> Item:
     """Return the protocol's line for a request, whose datum type is of no matter here."""
-    from enact_dist.core.messages import Item
-    from enact_dist.session import unknown_aspect
+    from enact_dist.access.session import unknown_aspect
+    from enact_dist.core.protocol.messages import Item
 
     world, entity, aspect, access = request
     world = world or default or ""

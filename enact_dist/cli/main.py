@@ -15,39 +15,19 @@ exit  meaning
 from __future__ import annotations
 
 import argparse
-import logging
 import os
 import re
 import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
-from enact_dist.cli.verbs import DONE, USAGE, exit_status, told
+from enact_dist.cli.verbs import DONE, NOUNS, USAGE, exit_status, told
 from enact_dist.errors import EnactError
-from enact_dist.supervise import end_with_supervisor
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
 INTERRUPTED: Final = 130
-
-MODULES: Final = {
-    "up": "up",
-    "shard": "shard",
-    "actor": "actor",
-    "world": "world",
-    "why": "lineage",
-    "impact": "lineage",
-    "record": "record",
-    "replay": "record",
-    "lock": "lock",
-    "doctor": "doctor",
-    "bench": "bench",
-    "verify": "verify",
-    "demo": "demo",
-    "workcell": "workcell",
-}
-"""Where each command stands, in the order in which `enact --help` shows them."""
 
 _EPILOG: Final = """\
 examples:
@@ -95,6 +75,21 @@ class _Parser(argparse.ArgumentParser):
 
 def build_parser(noun: str = "") -> argparse.ArgumentParser:
     """Return the parser of all nouns and verbs, or of one noun: that loads a third as much."""
+    parser, nouns = _top_parser()
+    for module in dict.fromkeys(NOUNS[name].module for name in ([noun] if noun else NOUNS)):
+        import_module(f"enact_dist.cli.{module}").add_to(nouns)
+    return parser
+
+
+def _overview() -> argparse.ArgumentParser:
+    """Return the parser of a command line without a noun: it loads none of them."""
+    parser, nouns = _top_parser()
+    for name in NOUNS:
+        nouns.add_parser(name, help=NOUNS[name].summary)
+    return parser
+
+
+def _top_parser() -> tuple[_Parser, argparse._SubParsersAction[_Parser]]:
     parser = _Parser(
         prog="enact",
         description="Distributed world contexts for robots.",
@@ -103,11 +98,7 @@ def build_parser(noun: str = "") -> argparse.ArgumentParser:
     )
     parser.add_argument("--debug", action="store_true", help="show tracebacks of errors")
     parser.add_argument("--version", action="store_true", help="print the version and leave")
-    nouns = parser.add_subparsers(metavar="COMMAND", title="commands", dest="noun")
-    modules = [MODULES[noun]] if noun in MODULES else dict.fromkeys(MODULES.values())
-    for module in modules:
-        import_module(f"enact_dist.cli.{module}").add_to(nouns)
-    return parser
+    return parser, parser.add_subparsers(metavar="COMMAND", title="commands", dest="noun")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -127,7 +118,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _main(words: list[str]) -> int:
     words, command = _split_command(words)
-    parser = build_parser(next(iter(words), ""))
+    noun = next((word for word in words if not word.startswith("-")), "")
+    parser = build_parser(noun) if noun in NOUNS else _overview()
     arguments = parser.parse_args(words)
     arguments.command = command
     if arguments.version:
@@ -157,6 +149,8 @@ def _version() -> int:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    from enact_dist.operate.supervise import end_with_supervisor
+
     try:
         end_with_supervisor()
         status: int = arguments.run(arguments)
@@ -185,6 +179,8 @@ def _report(error: Exception, arguments: argparse.Namespace) -> int:
 
 def _refusal(arguments: argparse.Namespace, text: str) -> str:
     """Return the line of a log of objects by which a process says why it does not run."""
+    import logging
+
     from enact_dist.link.log import JsonLines
 
     targets = [*getattr(arguments, "targets", ()), getattr(arguments, "process", "")]

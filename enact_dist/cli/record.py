@@ -6,12 +6,13 @@ import argparse
 import sys
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.cli.output import ProgressLine, print_json, shown_bytes, shown_s
-from enact_dist.cli.times import MOMENT_HELP, moment
+from enact_dist.cli.text.output import ProgressLine, print_json, shown_bytes, shown_s
+from enact_dist.cli.text.times import MOMENT_HELP, moment
 from enact_dist.cli.verbs import (
     CELL_DEFAULT,
     DONE,
     FAILED,
+    NOUNS,
     add_timeout,
     add_verb,
     cell_target,
@@ -25,9 +26,9 @@ from enact_dist.cli.verbs import (
 from enact_dist.link.signals import StopSignals
 
 if TYPE_CHECKING:
+    from enact_dist.access.arguments import When
     from enact_dist.cli.verbs import Verb
-    from enact_dist.config_shows import Shows
-    from enact_dist.moments import When
+    from enact_dist.config.shows import Shows
     from enact_dist.recording import RecordingSummary, ReplaySummary
 
 COMPRESSIONS: Final = ("zstd", "lz4", "none")
@@ -45,7 +46,7 @@ def _add_record(nouns: argparse._SubParsersAction[Verb]) -> None:
     record = add_verb(
         nouns,
         "record",
-        "record every version of a cell's data into an MCAP file until Ctrl-C",
+        NOUNS["record"].summary,
         run=run_record,
         example="enact record cell.toml --out run.mcap\n"
         "enact record tcp/robot:7447 --out run.mcap --world online --entities 'camera/*'"
@@ -82,7 +83,7 @@ def _add_replay(nouns: argparse._SubParsersAction[Verb]) -> None:
     replay = add_verb(
         nouns,
         "replay",
-        "commit a recording into a cell again, at its pace",
+        NOUNS["replay"].summary,
         run=run_replay,
         example="enact replay run.mcap --speed 0.5 --into cell.toml --world online=replayed\n"
         "enact replay run.mcap --speed 0 --from 10 --to 20\n"
@@ -186,8 +187,8 @@ def shows_of(arguments: argparse.Namespace) -> dict[str, Shows]:
     Raises:
         ConfigError: An option names no kind.
     """
-    from enact_dist.config import load_config
-    from enact_dist.config_shows import Shows
+    from enact_dist.config.read import load_config
+    from enact_dist.config.shows import Shows
 
     target = cell_target(arguments)
     declared = {}
@@ -262,7 +263,7 @@ def _moment_ns(when: When | None, begin_ns: int) -> int:
     Raises:
         MisuseError: It lies in the future, or before 1970.
     """
-    from enact_dist.moments import stamp_of
+    from enact_dist.access.arguments import stamp_of
 
     if when is None:
         return 0

@@ -8,17 +8,18 @@ import sys
 import time
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.cli.output import coloured
+from enact_dist.cli.text.output import coloured
 from enact_dist.cli.verbs import (
     CELL_DEFAULT,
     CELL_VARIABLE,
+    NOUNS,
     add_log,
     add_verb,
     cell_config,
     see_modules,
 )
-from enact_dist.config_table import suggestion
-from enact_dist.config_types import processes_of
+from enact_dist.config.table import suggestion
+from enact_dist.config.types import processes_of
 from enact_dist.errors import ConfigError, LinkError
 from enact_dist.link.signals import StopSignals
 
@@ -27,8 +28,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from enact_dist.cli.verbs import Verb
-    from enact_dist.config_types import ActorProcess, CellConfig, ShardConfig
-    from enact_dist.supervise import Say, Task
+    from enact_dist.config.types import ActorProcess, CellConfig, ShardConfig
+    from enact_dist.operate.supervise import Say, Task
 
 LOOK_S: Final = 0.2
 """How often a shard that runs already is looked at."""
@@ -41,7 +42,7 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     up = add_verb(
         nouns,
         "up",
-        "run every shard and actor of a cell on this machine until Ctrl-C",
+        NOUNS["up"].summary,
         run=run_up,
         example="enact up cell.toml\nenact up cell.toml --no-actors\n"
         "enact up cell.toml --without camera planner",
@@ -67,7 +68,7 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
 
 def run_up(arguments: argparse.Namespace) -> int:
     """Run the cell until a signal; drain actors, then shards."""
-    from enact_dist.supervise import Supervisor
+    from enact_dist.operate.supervise import Supervisor
 
     config = cell_config(arguments)
     see_modules(config.path)
@@ -138,7 +139,7 @@ def _refuse_homeless(config: CellConfig, shards: Sequence[ShardConfig], host: st
     Raises:
         ConfigError: Each machine would start them; the message says what to write.
     """
-    from enact_dist.link.endpoints import is_of_this_host
+    from enact_dist.link.zenoh.endpoints import is_of_this_host
 
     hosts = {one.host for one in config.shards} | {one.host for one in config.actors}
     named = sorted(hosts - {""})
@@ -165,7 +166,7 @@ def _refuse_misfits(config: CellConfig) -> None:
     Raises:
         ConfigError: The actors cannot run together.
     """
-    from enact_dist.actor_check import check_cell
+    from enact_dist.actor.check import check_cell
 
     findings = check_cell(config)
     for finding in findings:
@@ -187,13 +188,13 @@ def _refuse_second(config: CellConfig, shard: ShardConfig) -> None:
     Raises:
         LinkError: It does; the message says where.
     """
-    from enact_dist.link.endpoints import somebody_listens
+    from enact_dist.link.zenoh.endpoints import somebody_listens
 
     elsewhere = [endpoint for endpoint in shard.advertise if endpoint not in shard.listen]
     if not any(somebody_listens(endpoint) for endpoint in (*shard.listen, *elsewhere)):
         return
-    from enact_dist.link.shard_daemon import DRAIN_S, DaemonSettings, refuse_second_daemon
-    from enact_dist.supervise import END_S
+    from enact_dist.link.daemon.daemon import DRAIN_S, DaemonSettings, refuse_second_daemon
+    from enact_dist.operate.supervise import END_S
 
     settings = DaemonSettings(config.name, config.shard_settings(shard.name), shard.listen)
     drain_s = DRAIN_S if shard.drain_s is None else shard.drain_s
@@ -222,14 +223,14 @@ def _refuse_second(config: CellConfig, shard: ShardConfig) -> None:
 
 
 def _actor_task(config: CellConfig, process: ActorProcess, log: str) -> Task:
-    from enact_dist.supervise import Task
+    from enact_dist.operate.supervise import Task
 
     words = _command(config, "actor", process.members, log)
     return Task(process.name, "actor", words, process.drain_s or 0.0, process.env)
 
 
 def _task(config: CellConfig, kind: str, name: str, log: str, drain_s: float | None = None) -> Task:
-    from enact_dist.supervise import Task
+    from enact_dist.operate.supervise import Task
 
     return Task(name, kind, _command(config, kind, (name,), log), drain_s or 0.0)
 

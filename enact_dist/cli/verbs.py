@@ -6,9 +6,8 @@ import argparse
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
-from enact_dist.config_values import checked_endpoint, metrics_address
 from enact_dist.errors import ConfigError, ShardUnreachableError
 from enact_dist.terms import Entities, Entity, checked_name
 from enact_dist.wire.texts import shown
@@ -16,8 +15,8 @@ from enact_dist.wire.texts import shown
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from enact_dist.cell import Cell
-    from enact_dist.config_types import CellConfig
+    from enact_dist.config.types import CellConfig
+    from enact_dist.world.cell import Cell
 
 DONE: Final = 0
 FAILED: Final = 1
@@ -33,8 +32,56 @@ Verb = argparse.ArgumentParser
 """A parser of one verb, as `add_verb` returns it."""
 
 
-def add_noun(nouns: argparse._SubParsersAction[Verb], name: str, summary: str) -> Verb:
+class Noun(NamedTuple):
+    """One command of `enact`.
+
+    Attributes:
+        module: Where it stands, below `enact_dist.cli`; loaded when the command is used.
+        summary: What the help says of it.
+    """
+
+    module: str
+    summary: str
+
+
+NOUNS: Final = {
+    "up": Noun("up", "run every shard and actor of a cell on this machine until Ctrl-C"),
+    "shard": Noun("shard.shard", "run and list shard daemons"),
+    "actor": Noun("actor.actor", "run, list and check actors"),
+    "world": Noun("world.world", "look into world contexts, make and compare them, set data"),
+    "why": Noun(
+        "world.lineage", "show where a datum comes from: who committed it, what it was made of"
+    ),
+    "impact": Noun(
+        "world.lineage", "show what came of a datum: what it was used for, and that in turn"
+    ),
+    "record": Noun(
+        "record", "record every version of a cell's data into an MCAP file until Ctrl-C"
+    ),
+    "replay": Noun("record", "commit a recording into a cell again, at its pace"),
+    "lock": Noun("lock", "look at locks, hold one, break one, resolve one"),
+    "doctor": Noun(
+        "doctor",
+        "check this machine, the way to the cell, and whether that runs by its cell.toml:"
+        " libraries, memory, disk, shards, clocks",
+    ),
+    "bench": Noun(
+        "bench",
+        "measure locks, commits and data on this machine, beside the raw floor of the same run",
+    ),
+    "verify": Noun(
+        "verify",
+        "try to break the locks and commits of this version: simulated faults, a judge, no mercy",
+    ),
+    "demo": Noun("demo", "run a demonstration"),
+    "workcell": Noun("workcell", "calibrate the cameras of a cell"),
+}
+"""All commands, in the order in which `enact --help` shows them."""
+
+
+def add_noun(nouns: argparse._SubParsersAction[Verb], name: str) -> Verb:
     """Add a noun and return its parser."""
+    summary = NOUNS[name].summary
     return nouns.add_parser(name, help=summary, description=summary)
 
 
@@ -146,6 +193,8 @@ def whole(text: str) -> int:
 
 def endpoints(text: str) -> str:
     """Check endpoints, comma separated, or none; an `argparse` type."""
+    from enact_dist.config.types import checked_endpoint
+
     for endpoint in text.split(","):
         if endpoint.strip():
             _checked(checked_endpoint, endpoint.strip())
@@ -154,6 +203,8 @@ def endpoints(text: str) -> str:
 
 def address(text: str) -> str:
     """Check where metrics are to be served, or nothing; an `argparse` type."""
+    from enact_dist.config.types import metrics_address
+
     if text:
         _checked(metrics_address, text)
     return text
@@ -265,7 +316,7 @@ def cell_config(arguments: argparse.Namespace) -> CellConfig:
     Raises:
         ConfigError: It names an endpoint, or the file cannot be used.
     """
-    from enact_dist.config import load_config
+    from enact_dist.config.read import load_config
 
     target = cell_target(arguments)
     if is_endpoint(target):
@@ -297,7 +348,7 @@ def open_cell(arguments: argparse.Namespace, *, observer: bool = True, actor: st
         ConfigError: The cell is named wrongly.
         ShardUnreachableError: No shard answered in time.
     """
-    from enact_dist.connecting import connect
+    from enact_dist.world.connecting import connect
 
     timeout_s = getattr(arguments, "timeout_s", TIMEOUT_S)
     return connect(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from enact_dist.cli.verbs import add_verb, seconds, whole
+from enact_dist.cli.verbs import NOUNS, add_verb, seconds, whole
 
 if TYPE_CHECKING:
     import argparse
@@ -18,7 +18,7 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     verify = add_verb(
         nouns,
         "verify",
-        "try to break the locks and commits of this version: simulated faults, a judge, no mercy",
+        NOUNS["verify"].summary,
         run=run_verify,
         example="enact verify\n"
         "enact verify --minutes 10 --json\n"

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from enact_dist.cli.output import ProgressLine, print_json, print_table
+from enact_dist.cli.text.output import ProgressLine, print_json, print_table
 from enact_dist.cli.verbs import DONE, FAILED, add_noun, add_verb, verbs_of, whole
 from enact_dist.errors import ConfigError, EnactError
 
@@ -26,7 +26,7 @@ _COLUMNS: Final = (
 
 def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
     """Add the noun and its verbs."""
-    verbs = verbs_of(add_noun(nouns, "workcell", "calibrate the cameras of a cell"))
+    verbs = verbs_of(add_noun(nouns, "workcell"))
     verb = add_verb(
         verbs,
         "calibrate",

@@ -11,16 +11,16 @@ A carrier decides nothing.  Every carrier keeps these rules:
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, Final, Protocol, cast, get_args
+from typing import TYPE_CHECKING, Final, Protocol, get_args
 
-from enact_dist.core.messages import Answer
+from enact_dist.core.protocol.messages import Answer
 from enact_dist.errors import ConfigError, LinkError, MisuseError, ProtocolError
 from enact_dist.wire.frames import decode_frame
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from enact_dist.core.messages import Notice, Request, ShardEntry, Survey
+    from enact_dist.core.protocol.messages import Notice, Request, ShardEntry, Survey
     from enact_dist.link.notices import Skipped
 
 
@@ -74,7 +74,7 @@ def read_answer(shard: str, header: bytes, payload: bytes | memoryview) -> Answe
     answer = decode_frame(header, payload)
     if type(answer) not in _ANSWERS:
         raise ProtocolError(f"shard {shard} answered with a {type(answer).__name__}")
-    return cast("Answer", answer)
+    return answer  # type: ignore[return-value]  # one of these
 
 
 class NoticeFeed(Protocol):

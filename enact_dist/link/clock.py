@@ -50,10 +50,7 @@ class SystemClock:
 
     __slots__ = ()
 
-    def monotonic_ns(self) -> int:
-        """Return this host's monotonic time."""
-        return time.monotonic_ns()
-
-    def wall_ns(self) -> int:
-        """Return this host's wall clock, since 1970."""
-        return time.time_ns()
+    monotonic_ns = staticmethod(time.monotonic_ns)
+    """Return this host's monotonic time."""
+    wall_ns = staticmethod(time.time_ns)
+    """Return this host's wall clock, since 1970."""

@@ -26,12 +26,10 @@ import threading
 import time
 from collections import deque
 from contextlib import ExitStack
+from threading import get_ident
 from typing import TYPE_CHECKING, Final, cast
 
-from enact_dist.core import owners
-from enact_dist.core.catalogue import REMEDY
-from enact_dist.core.epochs import state_of, unkept_epoch
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.messages import (
     Acquire,
     AwaitStamp,
     Commit,
@@ -42,7 +40,7 @@ from enact_dist.core.messages import (
     Refused,
     Stage,
 )
-from enact_dist.core.records import (
+from enact_dist.core.protocol.records import (
     Compare,
     Drain,
     MakeRoom,
@@ -54,34 +52,34 @@ from enact_dist.core.records import (
     Story,
     Tick,
 )
-from enact_dist.core.shard import Shard
+from enact_dist.core.shard import owners
+from enact_dist.core.shard.shard import Shard
+from enact_dist.core.state.catalogue import REMEDY
+from enact_dist.core.state.clock import state_of, unkept_epoch
 from enact_dist.errors import StoreError
 from enact_dist.link.clock import Clock, SystemClock
 from enact_dist.link.host_figures import figures_of, latencies_of
-from enact_dist.link.payload_desk import PayloadDesk, half_of, names_payloads
-from enact_dist.link.stalls import Stalls
-from enact_dist.link.uninterrupted import Uninterrupted
+from enact_dist.link.host_guards import Stalls, Uninterrupted
+from enact_dist.link.memory.payload_desk import PayloadDesk, half_of, names_payloads
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from enact_dist.core.latencies import Latencies
-    from enact_dist.core.messages import Answer, Notice, Request
-    from enact_dist.core.records import Effect, Event
-    from enact_dist.core.shard_state import ShardSettings
-    from enact_dist.link.shared_folder import SharedFolder
-    from enact_dist.link.store import Store
-    from enact_dist.link.store_thread import StoreThread
+    from enact_dist.core.protocol.messages import Answer, Notice, Request
+    from enact_dist.core.protocol.records import Effect, Event
+    from enact_dist.core.shard.state import ShardSettings
+    from enact_dist.core.state.clock import Latencies
+    from enact_dist.link.memory.shared_folder import SharedFolder
+    from enact_dist.link.store.store import Store
+    from enact_dist.link.store.thread import StoreThread
 
 TICK_S_MAX: Final = 0.1
 """Longest pause between two timer wake-ups: bounds how late an expiry may be."""
 TICK_S_MIN: Final = 0.001
 """Shortest pause of the timer; deadlines of many locks then share one tick."""
 _SOON_NS: Final = TICK_S_MAX * 1e9
-# Tuples: a union would be rebuilt for each message.
-_TOLD_LATER: Final = (Publish, Story)
-_THAT_MAY_WAIT: Final = (Acquire, AwaitStamp)
+_TOLD_LATER: Final = (Publish, Story)  # a union would be rebuilt for each message
 PARKED_MAX: Final = 100_000
 """Requests that may be parked at one time."""
 JOIN_S: Final = 0.5
@@ -109,8 +107,8 @@ def open_host(
     if folder is None:
         store, recovered = None, Recovered(epoch=unkept_epoch(wall_ns))
     else:
-        from enact_dist.link.store import open_store
-        from enact_dist.link.store_folder import refuse_far_stamps, refuse_strangers
+        from enact_dist.link.folder.folder import refuse_far_stamps, refuse_strangers
+        from enact_dist.link.store.store import open_store
 
         store, recovered = open_store(folder, unix_s=wall_ns // 1_000_000_000)
         with ExitStack() as undo:
@@ -191,7 +189,7 @@ class ShardHost:
         self._timer.start()
 
     def _start_store(self, store: Store) -> StoreThread:
-        from enact_dist.link.store_thread import StoreThread
+        from enact_dist.link.store.thread import StoreThread
 
         return StoreThread(store, self._persisted, self._fail)
 
@@ -244,7 +242,7 @@ class ShardHost:
         """
         kind = type(message)
         if kind is Commit or kind is Prepare:
-            commit = cast("Commit", message)
+            commit: Commit = message  # type: ignore[assignment]  # as just found
             if names_payloads(commit) and self._refusal(commit, identity) is None:
                 message = self._payloads.with_bodies(commit)  # otherwise staged data stay
         elif kind is Stage:
@@ -262,18 +260,16 @@ class ShardHost:
             self._handles += 1
             self._replies[self._handles] = reply
             self._handle(message, self._handles, identity)
-            self._look_at_clock_for(message)
+            if self._handles in self._replies or kind is Hello:
+                self._look_at_clock_for(message)
 
     def _stage(self, message: Stage, reply: Callable[[Answer], None], identity: str) -> None:
         if self._ended:
             return
         refusal = self._refusal(message, identity)
-        if refusal is not None:
-            reply(refusal)
-        elif message.total and message.session not in self._shard.state.sessions.by_id:
-            reply(EpochChanged(self.epoch))
-        else:
-            reply(self._payloads.stage(message, identity))
+        if message.total and message.session not in self._shard.state.sessions.by_id:
+            refusal = refusal or EpochChanged(self.epoch)
+        reply(refusal or self._payloads.stage(message, identity))
 
     def _refusal(self, message: Request, identity: str) -> Refused | EpochChanged | None:
         """Return why the shard will refuse a message because of its sender, else None."""
@@ -302,7 +298,7 @@ class ShardHost:
     def _biggest(self) -> str:
         """Return the slots with the largest data, for people."""
         with self._mutex:
-            names = ", ".join(f"{name} {size}" for name, size in self._shard.biggest(3))
+            names = ", ".join([f"{name} {size}" for name, size in self._shard.biggest(3)])
         return f"; the largest: {names}" if names else ""
 
     def call_with(
@@ -313,13 +309,14 @@ class ShardHost:
 
     def watch(self, watcher: Callable[[Notice], None]) -> Callable[[], None]:
         """Call `watcher` with each notice, in order; return a function that ends this."""
+
+        def unwatch() -> None:
+            with self._mutex:
+                self._watchers = tuple(other for other in self._watchers if other is not watcher)
+
         with self._mutex:
             self._watchers = (*self._watchers, watcher)
-        return lambda: self._unwatch(watcher)
-
-    def _unwatch(self, watcher: Callable[[Notice], None]) -> None:
-        with self._mutex:
-            self._watchers = tuple(other for other in self._watchers if other is not watcher)
+        return unwatch
 
     def add_inbox(self, drain: Callable[[], None]) -> None:
         """Call `drain` before each tick; it submits requests that have already arrived."""
@@ -337,19 +334,25 @@ class ShardHost:
 
     def _handle(self, message: Request | Event, handle: int, identity: str = "") -> None:
         """Let the shard decide, and perform its effects.  The mutex is held."""
-        with self._uninterrupted:
-            try:
-                self._perform(self._decide(message, handle, identity))
-                while self._kept_at_once:
-                    self._perform(self._decide(Persisted(self._kept_at_once.popleft()), 0))
-                if self._draining and self._shard.idle:
-                    self._rests.set()
-            except BaseException as failure:
-                # A half-made decision must not be used.
-                _log.exception("the shard failed on %s", type(message).__name__)
-                self._end_failed(failure)
-                if not isinstance(failure, Exception):
-                    raise
+        if get_ident() == self._uninterrupted.main:
+            with self._uninterrupted:
+                self._handle_now(message, handle, identity)
+        else:
+            self._handle_now(message, handle, identity)
+
+    def _handle_now(self, message: Request | Event, handle: int, identity: str) -> None:
+        try:
+            self._perform(self._decide(message, handle, identity))
+            while self._kept_at_once:
+                self._perform(self._decide(Persisted(self._kept_at_once.popleft()), 0))
+            if self._draining and self._shard.idle:
+                self._rests.set()
+        except BaseException as failure:
+            # A half-made decision must not be used.
+            _log.exception("the shard failed on %s", type(message).__name__)
+            self._end_failed(failure)
+            if not isinstance(failure, Exception):
+                raise
 
     def _decide(self, message: Request | Event, handle: int, identity: str = "") -> list[Effect]:
         clock = self._clock
@@ -449,12 +452,9 @@ class ShardHost:
                 self._look_again = False
 
     def _look_at_clock_for(self, message: Request) -> None:
-        """Wake the timer if this parked request times out before the next tick."""
-        if isinstance(message, _THAT_MAY_WAIT):
-            begins_soon = self._handles in self._replies and message.wait_ns < _SOON_NS
-        else:
-            begins_soon = isinstance(message, Hello) and message.ttl_ns // 8 < _SOON_NS
-        if begins_soon:
+        """Wake the timer if this parked request, or this hello, asks for an earlier tick."""
+        parked = isinstance(message, Acquire | AwaitStamp) and message.wait_ns < _SOON_NS
+        if parked or (isinstance(message, Hello) and message.ttl_ns // 8 < _SOON_NS):
             self._wake_timer()
 
     def _wake_timer(self) -> None:

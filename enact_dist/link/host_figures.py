@@ -1,4 +1,4 @@
-"""The figures of a running shard: counters, current values and latencies; see `link.metrics`.
+"""The figures of a running shard: counters, current values and latencies (`link.daemon.metrics`).
 
 They are read without the host's mutex, so that reading never delays the shard; one figure may be
 slightly older than the next.
@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from enact_dist.core.inspection import counted
-from enact_dist.core.latencies import Latencies
+from enact_dist.core.shard.inspection import counted
+from enact_dist.core.state.clock import Latencies
 
 if TYPE_CHECKING:
-    from enact_dist.core.shard_state import ShardState
-    from enact_dist.link.payload_desk import PayloadDesk
-    from enact_dist.link.store_thread import StoreThread
+    from enact_dist.core.shard.state import ShardState
+    from enact_dist.link.memory.payload_desk import PayloadDesk
+    from enact_dist.link.store.thread import StoreThread
 
 
 def figures_of(

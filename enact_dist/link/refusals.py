@@ -9,11 +9,11 @@ import re
 import time
 from typing import TYPE_CHECKING
 
-from enact_dist.core.messages import Forgotten
-from enact_dist.core.multilock import MultiLock
-from enact_dist.core.owners import PERMISSION
-from enact_dist.core.phase import Phase
-from enact_dist.core.tenures import HELD_TOO_LONG
+from enact_dist.core.client.lock import MultiLock
+from enact_dist.core.client.plan import Phase
+from enact_dist.core.protocol.messages import Forgotten
+from enact_dist.core.shard.owners import PERMISSION
+from enact_dist.core.state.grants import HELD_TOO_LONG
 from enact_dist.errors import (
     ChangedError,
     ClockSkewError,
@@ -37,7 +37,7 @@ from enact_dist.terms import ACCESSES
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from enact_dist.core.messages import Holder, Item, Refused
+    from enact_dist.core.protocol.messages import Holder, Item, Refused
 
 
 def unreachable(

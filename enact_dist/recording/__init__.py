@@ -33,11 +33,11 @@ module          what it does
 `exporting`     one world context as of one moment, into a file
 ==============  ==================================================================================
 
-`cell.toml` describes how to show the data of an aspect (`enact_dist.config_shows`).  The
+`cell.toml` describes how to show the data of an aspect (`enact_dist.config.shows`).  The
 packages that all this needs are those of the extra ``record``.
 """
 
-from enact_dist.config_shows import Shows
+from enact_dist.config.shows import Shows
 from enact_dist.recording.libraries import require_libraries
 
 require_libraries()

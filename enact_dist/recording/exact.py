@@ -33,7 +33,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgpack
 
-from enact_dist.core.datum import Datum, Slot
+from enact_dist.core.protocol.datum import Datum, Slot
 from enact_dist.errors import ProtocolError
 from enact_dist.terms import NullReason
 

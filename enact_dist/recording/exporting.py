@@ -6,20 +6,20 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.config_shows import GUESSED
-from enact_dist.core.messages import Item
+from enact_dist.config.shows import GUESSED
+from enact_dist.core.protocol.messages import Item
 from enact_dist.recording.exact import Recorded
 from enact_dist.recording.file import RecordingFile
 from enact_dist.terms import Access
-from enact_dist.version_data import viewed
+from enact_dist.world.version_data import viewed
 
 if TYPE_CHECKING:
     import os
     from collections.abc import Iterator, Mapping
 
-    from enact_dist.config_shows import Shows
-    from enact_dist.core.lock_parts import Reading
-    from enact_dist.world import WorldContext
+    from enact_dist.config.shows import Shows
+    from enact_dist.core.client.plan import Reading
+    from enact_dist.world.context import WorldContext
 
 PORTION_BYTES: Final = 64 << 20
 """How much is fetched at once."""

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from google.protobuf.descriptor import FileDescriptor
     from google.protobuf.message import Message
 
-    from enact_dist.config_shows import Shows
-    from enact_dist.core.messages import AspectEntry
+    from enact_dist.config.shows import Shows
+    from enact_dist.core.protocol.messages import AspectEntry
     from enact_dist.recording.exact import Recorded
     from enact_dist.recording.pictures import Picture
 

@@ -11,20 +11,20 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.actor_report import read_reports
-from enact_dist.core.datum import Slot
+from enact_dist.actor.report import read_reports
+from enact_dist.core.protocol.datum import Slot
 from enact_dist.errors import EnactError, ProtocolError
 from enact_dist.patterns import pattern_matches
-from enact_dist.version_data import Wanted, explained
+from enact_dist.world.version_data import Wanted, explained
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator
 
-    from enact_dist.cell import Cell
-    from enact_dist.cell_info import ActorInfo
-    from enact_dist.core.lock_parts import Reading
-    from enact_dist.core.multilock import MultiLock
-    from enact_dist.session import Session
+    from enact_dist.access.session import Session
+    from enact_dist.core.client.lock import MultiLock
+    from enact_dist.core.client.plan import Reading
+    from enact_dist.world.cell import Cell
+    from enact_dist.world.listings import ActorInfo
 
 NAMED_MAX: Final = 3
 """So many slots of one writer are named, the others counted."""

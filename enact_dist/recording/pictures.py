@@ -1,6 +1,6 @@
 """A datum as messages that Foxglove shows and Rerun converts: images, clouds, meshes, poses, JSON.
 
-`enact_dist.config_shows` lists what is shown as which kind.  Geometry is protobuf: Rerun converts
+`enact_dist.config.shows` lists what is shown as which kind.  Geometry is protobuf: Rerun converts
 Foxglove's schemas in that encoding only, and an image in JSON would be a third larger for its
 base64.  Stamps inside messages are the capture's, else the commit's.
 """
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from google.protobuf.message import Message
     from numpy.typing import NDArray
 
-    from enact_dist.config_shows import Shows
+    from enact_dist.config.shows import Shows
     from enact_dist.recording.exact import Recorded
 
 ELEMENTS_MAX: Final = 256

@@ -17,27 +17,27 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.asking import present_ns
-from enact_dist.config_shows import GUESSED
-from enact_dist.core.datum import Slot
+from enact_dist.access.asking import present_ns
+from enact_dist.access.watch import Watch
+from enact_dist.config.shows import GUESSED
+from enact_dist.core.protocol.datum import Slot
 from enact_dist.errors import ConfigError, LinkError, LockTimeoutError, UnknownWorldError
 from enact_dist.recording.disk import QUEUE_BYTES_MAX, DiskThread
 from enact_dist.recording.exact import Recorded
 from enact_dist.recording.file import CHUNK_BYTES, CHUNK_S, RecordingFile
 from enact_dist.recording.settling import END_S, Settling
 from enact_dist.terms import Entities, NullReason
-from enact_dist.version_data import Found, Wanted, between, explained, found_of
-from enact_dist.watch import Watch
+from enact_dist.world.version_data import Found, Wanted, between, explained, found_of
 
 if TYPE_CHECKING:
     import os
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
-    from enact_dist.cell import Cell
-    from enact_dist.config_shows import Shows
-    from enact_dist.core.datum import LockId
-    from enact_dist.core.messages import AspectEntry, VersionEntry
-    from enact_dist.watch import Change
+    from enact_dist.access.watch import Change
+    from enact_dist.config.shows import Shows
+    from enact_dist.core.protocol.datum import LockId
+    from enact_dist.core.protocol.messages import AspectEntry, VersionEntry
+    from enact_dist.world.cell import Cell
 
 SETTLE_S: Final = 0.25
 """How long a commit rests before it is recorded; with `settling.SHOWN_S` below the 2 s for which

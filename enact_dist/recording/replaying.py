@@ -11,9 +11,10 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.config_table import suggestion
-from enact_dist.core.datum_types import succeeds, type_conflict
-from enact_dist.core.messages import AspectEntry, Item
+from enact_dist.access.writes import Writing
+from enact_dist.config.table import suggestion
+from enact_dist.core.protocol.datum_types import succeeds, type_conflict
+from enact_dist.core.protocol.messages import AspectEntry, Item
 from enact_dist.errors import ConfigError, DatumTypeError, MisuseError
 from enact_dist.patterns import pattern_matches
 from enact_dist.recording.other_writers import OtherWriters
@@ -21,17 +22,16 @@ from enact_dist.recording.reading import Commit, Recording
 from enact_dist.terms import Access, Entities, checked_name
 from enact_dist.wire.limits import BODY_BYTES_MAX, ITEMS_MAX
 from enact_dist.wire.payload import Encoded
-from enact_dist.writing import Writing
 
 if TYPE_CHECKING:
     import os
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
-    from enact_dist.cell import Cell
-    from enact_dist.core.datum import Datum, Slot
+    from enact_dist.access.session import Session
+    from enact_dist.core.protocol.datum import Datum, Slot
     from enact_dist.recording.exact import Recorded
-    from enact_dist.session import Session
-    from enact_dist.world import WorldContext
+    from enact_dist.world.cell import Cell
+    from enact_dist.world.context import WorldContext
 
 WAIT_S: Final = 10.0
 HOLD_S: Final = 60.0

@@ -14,12 +14,12 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.asking import present_ns
-from enact_dist.core.messages import AwaitStamp, Reached
+from enact_dist.access.asking import present_ns
+from enact_dist.core.protocol.messages import AwaitStamp, Reached
 from enact_dist.errors import LinkError
 
 if TYPE_CHECKING:
-    from enact_dist.link.client import CellClient
+    from enact_dist.link.client.locks import CellClient
 
 SHOWN_S: Final = 1.0
 """How long a commit waits for shards that do not show it yet."""

@@ -16,7 +16,7 @@ import threading
 import time
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.config_environment import without_overrides
+from enact_dist.config.environment import without_overrides
 from enact_dist.errors import LinkError
 from enact_dist.link.log import in_words
 

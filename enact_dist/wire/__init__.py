@@ -8,8 +8,8 @@ attachment and the payload of a query, reply or put).  The header is one msgpack
 
     [version = 7, code, field, field, …]
 
-The code says which message it is; the fields are those of the class in `core.messages`, in order.
-A NamedTuple is the array of its fields, a tuple an array, None is nil.  A datum is the array
+The code says which message it is; the fields are those of the class in `core.protocol.messages`, in
+order. A NamedTuple is the array of its fields, a tuple an array, None is nil.  A datum is the array
 ``[encoding: bin, offset: int, size: int, stamp_ns: int, file: str]``; its body is the `size` bytes
 at `offset` of the payload.  Bodies follow one another in the order of the header, each at the next
 multiple of 64, zeros between, nothing after the last; an empty body has offset 0.  Where `file` is
@@ -62,10 +62,10 @@ is built; what this version does not know is refused; a change of the format rai
 ===============  =================================================================================
 module           what it decides
 ===============  =================================================================================
-`frames`         message ↔ header and payload (`message_parts`: field by field; `bodies`: layout)
+`frames`         message ↔ header and payload (`parts`: field by field; `bodies`: layout)
 `payload`        value ↔ datum (`tree_writer`, `tree_reader`: the tree; `arrays`: numpy)
 `shapes`         what a Python type means as a datum; `fingerprint` is its text, by which
-                 `core.datum_types` decides which types go together
+                 `core.protocol.datum_types` decides which types go together
 `codecs`         types that are no plain data
 `keys`           names of shards, sessions and requests on Zenoh
 `limits`         the longest of everything

@@ -9,7 +9,7 @@ from __future__ import annotations
 import reprlib
 from typing import Any, Final
 
-from enact_dist.core.datum import Datum
+from enact_dist.core.protocol.datum import Datum
 from enact_dist.errors import ProtocolError
 from enact_dist.wire.limits import (
     ALIGNMENT,

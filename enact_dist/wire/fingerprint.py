@@ -3,7 +3,7 @@
 Structural: names of dataclasses and fields and the shapes below them, as text, so that an error
 can show both sides.  Modules do not count: a dataclass may move.
 A field that has a default is marked with ``=``: such a field may be added to a type that is in
-use (`core.datum_types`).
+use (`core.protocol.datum_types`).
 Rule to keep: catalogues store fingerprints, so one never changes, but for its marks, while its type
 does not.
 """
@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 from typing import Any, Final
 
-from enact_dist.core.datum_types import DEFAULT_MARK
+from enact_dist.core.protocol.datum_types import DEFAULT_MARK
 from enact_dist.wire.shapes import shape_of, text_of
 
 FINGERPRINT_CHARACTERS_MAX: Final = 2000

@@ -15,11 +15,11 @@ from __future__ import annotations
 
 import reprlib
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, cast, get_args
+from typing import TYPE_CHECKING, Any, Final, get_args
 
 import msgpack
 
-from enact_dist.core import messages as m
+from enact_dist.core.protocol import messages as m
 from enact_dist.errors import ProtocolError
 from enact_dist.wire.bodies import BodyReader, BodyWriter
 from enact_dist.wire.limits import (
@@ -32,9 +32,8 @@ from enact_dist.wire.limits import (
     TEXT_BYTES_MAX,
 )
 from enact_dist.wire.long_headers import LONG_HEADER_BYTES, LongHeaders
-from enact_dist.wire.message_parts import reader_of, values_of, writers_of
-from enact_dist.wire.quick_readers import quick_reader_of
-from enact_dist.wire.texts import refuse_unsafe
+from enact_dist.wire.message_parts import Read, reader_of, values_of, writers_of
+from enact_dist.wire.quick_readers import quick_reader_of, safe_reader
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -143,12 +142,15 @@ def encode_parts(message: m.Message) -> tuple[bytes, list[bytes | memoryview]]:
     Raises:
         ProtocolError: As `encode_frame`.
     """
+    pieces: list[bytes | memoryview] = []
     try:
         code, values, writers = _writers[type(message)]
         parts = [FRAME_VERSION, code, *values(message)]
-        bodies = BodyWriter()
-        for index, write in writers:
-            parts[index + 2] = write(parts[index + 2], bodies)
+        if writers:
+            bodies = BodyWriter()
+            pieces = bodies.parts
+            for index, write in writers:
+                parts[index + 2] = write(parts[index + 2], bodies)
         header: bytes = msgpack.packb(parts)
     except (TypeError, ValueError, OverflowError, KeyError) as error:
         raise ProtocolError(f"{type(message).__name__} cannot be sent: {error}") from error
@@ -157,25 +159,21 @@ def encode_parts(message: m.Message) -> tuple[bytes, list[bytes | memoryview]]:
             f"{type(message).__name__} has a header of {len(header)} bytes; at most"
             f" {HEADER_BYTES_MAX}; ask for less at once"
         )
-    size = len(header) + sum(map(len, bodies.parts))
+    size = len(header) + sum(map(len, pieces)) if pieces else 0
     if size > FRAME_BYTES_MAX:
         raise FrameTooLongError(
             f"{type(message).__name__} has {size} bytes; at most {FRAME_BYTES_MAX}; ask for, or"
             " write, less at once"
         )
-    return header, bodies.parts
+    return header, pieces
 
 
-def encode_answer(answer: m.Answer) -> tuple[bytes, list[bytes | memoryview], str]:
-    """Return an answer as `encode_parts` does, or what refuses the request in its place, and why.
+def refusal_of(error: ProtocolError) -> m.Refused:
+    """Return what refuses the request in place of an answer that cannot be sent.
 
     Without any answer a client would take the shard for dead, and ask again and again.
     """
-    try:
-        return *encode_parts(answer), ""
-    except ProtocolError as error:
-        code = "too_long" if isinstance(error, FrameTooLongError) else "protocol"
-        return *encode_parts(m.Refused(code, str(error))), str(error)
+    return m.Refused("too_long" if isinstance(error, FrameTooLongError) else "protocol", str(error))
 
 
 def decode_frame(header: bytes, payload: bytes | memoryview = b"") -> m.Message:
@@ -197,7 +195,8 @@ def _decoded(
             f"a frame of {len(header)} + {len(payload)} bytes came; at most {HEADER_BYTES_MAX} +"
             f" {PAYLOAD_BYTES_MAX}"
         )
-    _check_version(header)
+    if len(header) < 2 or header[1] != FRAME_VERSION or not 0x92 <= header[0] <= 0x9F:
+        _check_version(header)
     try:
         values = unpack(header)
     except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
@@ -208,10 +207,8 @@ def _decoded(
         raise ProtocolError(
             f"a frame has the unknown code {reprlib.repr(code)}; is the peer newer?"
         )
-    bodies = BodyReader(payload)
+    bodies = BodyReader(payload) if payload else _NO_BODIES
     try:
-        if code < _FIRST_ANSWER:
-            refuse_unsafe(values)
         message: m.Message = read(values[2:], bodies)
     except RecursionError as error:
         raise ProtocolError("a frame is nested too deeply") from error
@@ -239,7 +236,7 @@ def decode_request(header: bytes, payload: bytes | memoryview = b"") -> m.Reques
             f"a {kind.__name__} carries {len(payload)} bytes of data; at most {COMMIT_BYTES_MAX}"
             " travel with it, send what is more ahead of it in slices (Stage)"
         )
-    return cast("m.Request", message)
+    return message  # type: ignore[return-value]  # one of these
 
 
 def _check_version(header: bytes) -> None:
@@ -256,7 +253,8 @@ def _check_version(header: bytes) -> None:
         )
 
 
-_FIRST_ANSWER: Final = CODES[m.Welcome]
+_NO_BODIES: Final = BodyReader(b"")
+"""For all frames without a payload: nothing can be taken from it, so it never changes."""
 _writers: Final = {cls: (code, values_of(cls), writers_of(cls)) for cls, code in CODES.items()}
 _REQUESTS: Final = frozenset(get_args(m.Request))
 _COMMITS: Final = frozenset((m.Commit, m.Prepare))
@@ -276,10 +274,16 @@ _OF_EVERY_LOCK: Final = frozenset(
         m.Notice,
     )
 )
-_readers: Final = {
-    code: (quick_reader_of if cls in _OF_EVERY_LOCK else reader_of)(cls)
-    for cls, code in CODES.items()
-}
+
+
+def _reader_of(cls: type[Any]) -> Read:
+    """Return what reads a message; the texts of a request must be safe to show."""
+    safe = cls in _REQUESTS
+    read = safe_reader(reader_of(cls)) if safe else reader_of(cls)
+    return quick_reader_of(cls, read, printable=safe) if cls in _OF_EVERY_LOCK else read
+
+
+_readers: Final = {code: _reader_of(cls) for cls, code in CODES.items()}
 _long_requests: Final = LongHeaders({CODES[cls]: cls for cls in _REQUESTS}, _limits)
 _uncoded = set(get_args(m.Message)) ^ set(CODES)
 assert not _uncoded, f"no message, or one without a code: {_uncoded}"

@@ -12,7 +12,7 @@ key                                           what
 No name starts with ``@`` and Zenoh's wildcards do not match a chunk that does, so requests and the
 rest cannot collide.  `ANY` stands for all shards, all sessions, or (in requests) all cells.  An
 identity (`identity_of`) is the sender: the access rules of a Zenoh session and the shard itself
-compare it, see `enact_dist.core.owners`.
+compare it, see `enact_dist.core.shard.owners`.
 Rules to keep: a key holds only characters that Zenoh allows (no ``# ? $``, no empty chunk), and
 making a key from the parts of one gives the same key again.
 """
@@ -28,7 +28,7 @@ from enact_dist.errors import ProtocolError
 from enact_dist.terms import checked_name
 
 if TYPE_CHECKING:
-    from enact_dist.core.messages import Message
+    from enact_dist.core.protocol.messages import Message
 
 ROOT: Final = "enact"
 ANY: Final = "*"

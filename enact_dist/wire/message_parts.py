@@ -19,7 +19,7 @@ from itertools import product
 from operator import attrgetter
 from typing import Any, Final, get_args, get_origin, get_type_hints
 
-from enact_dist.core.datum import Datum
+from enact_dist.core.protocol.datum import Datum
 from enact_dist.errors import ProtocolError
 from enact_dist.wire.bodies import BodyReader, BodyWriter
 from enact_dist.wire.limits import (

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import msgpack
 import numpy as np
 
-from enact_dist.core.datum import Datum
+from enact_dist.core.protocol.datum import Datum
 from enact_dist.errors import DatumTypeError, ProtocolError
 from enact_dist.wire.limits import (
     BODY_BYTES_MAX,

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Final, NamedTuple, NoReturn
 import msgpack
 import numpy as np
 
-from enact_dist.core.datum import Datum
+from enact_dist.core.protocol.datum import Datum
 from enact_dist.errors import DatumTypeError, ProtocolError
 from enact_dist.wire.arrays import DtypeError, array_over
 from enact_dist.wire.limits import (
@@ -302,7 +302,7 @@ def _build_record(node: Any, shape: RecordOf, where: str, depth: int) -> Any:
 
 
 def _build_other_record(node: RecordNode, shape: RecordOf, where: str, depth: int) -> Any:
-    """Return the value for a node of an older or of a newer type (`core.datum_types`).
+    """Return the value for a node of an older or of a newer type (`core.protocol.datum_types`).
 
     An older type lacks fields, which get their defaults; fields that a newer one has are left out.
     """

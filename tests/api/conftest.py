@@ -21,9 +21,9 @@ def cell(carrier, tmp_path, monkeypatch):
         with local(worlds=list(WORLDS)) as opened:
             yield opened
         return
-    from enact_dist.core.messages import PlacementMap, ShardEntry
-    from enact_dist.core.shard_state import ShardSettings
-    from enact_dist.link.shard_daemon import DaemonSettings, start_shard
+    from enact_dist.core.protocol.messages import PlacementMap, ShardEntry
+    from enact_dist.core.shard.state import ShardSettings
+    from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
 
     monkeypatch.setenv("ENACT_SHARED_FOLDER", str(tmp_path))
     endpoint = free_endpoint()
@@ -41,7 +41,7 @@ class TwoShards:
     """Shards "left" and "right" in this process; entities go by the first part of their name."""
 
     def __init__(self, folder=None):
-        from enact_dist.core.messages import Pin, PlacementMap, ShardEntry
+        from enact_dist.core.protocol.messages import Pin, PlacementMap, ShardEntry
 
         self._folder = folder
         self._endpoints = {name: free_endpoint() for name in ("left", "right")}
@@ -56,8 +56,8 @@ class TwoShards:
         self.cell = self.connect()
 
     def start(self, name):
-        from enact_dist.core.shard_state import ShardSettings
-        from enact_dist.link.shard_daemon import DaemonSettings, start_shard
+        from enact_dist.core.shard.state import ShardSettings
+        from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
 
         settings = ShardSettings(name, self._placement, worlds=WORLDS)
         folder = self._folder / name if self._folder is not None else None
@@ -116,7 +116,7 @@ class Loose:
 @pytest.fixture
 def loose(monkeypatch):
     """What is replaced in shards of this process stays for cuts until `loose.end()`."""
-    from enact_dist.core import history
+    from enact_dist.core.state import history
 
     monkeypatch.setattr(history, "LOOSE_NS", Loose())
     return history.LOOSE_NS

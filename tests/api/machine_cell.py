@@ -35,15 +35,15 @@ from time_cell import (
 )
 
 from enact_dist import Entities, Entity, Lock, Read, View, Write, local
-from enact_dist.core.datum import Position
-from enact_dist.core.messages import AwaitStamp
+from enact_dist.core.protocol.datum import Position
+from enact_dist.core.protocol.messages import AwaitStamp
 from enact_dist.errors import ForgottenError, NullDatumError, UnknownWorldError
 from enact_dist.terms import NullReason, ViewEach
 
 if TYPE_CHECKING:
-    from enact_dist.cell import Cell
-    from enact_dist.history import Version
-    from enact_dist.past_context import PastContext
+    from enact_dist.world.cell import Cell
+    from enact_dist.world.history import Version
+    from enact_dist.world.past import PastContext
 
 
 class CellMachine(RuleBasedStateMachine):

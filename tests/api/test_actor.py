@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from enact_dist.actor import Actor, Declaration
+from enact_dist.access.together import Together
+from enact_dist.actor.actor import Actor, Declaration
 from enact_dist.errors import MisuseError
 from enact_dist.terms import (
     Aspect,
@@ -18,7 +19,6 @@ from enact_dist.terms import (
     Write,
     WriteEach,
 )
-from enact_dist.together import Together
 
 training, online = World("training"), World("online")
 PRODUCTS, SYSTEM = Entities("product/*"), Entity("system")

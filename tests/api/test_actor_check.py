@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from enact_dist.actor import Actor
-from enact_dist.actor_check import ActorDeclaration, Finding, check_actors, check_cell
-from enact_dist.config import load_config
+from enact_dist.actor.actor import Actor
+from enact_dist.actor.check import ActorDeclaration, Finding, check_actors, check_cell
+from enact_dist.config.read import load_config
 from enact_dist.terms import Aspect, Entities, Entity, View, ViewEach, World, Write, WriteEach
 
 if TYPE_CHECKING:

@@ -4,11 +4,11 @@ import importlib
 
 import pytest
 
-from enact_dist.actor import Actor
-from enact_dist.actor_check import ActorDeclaration, check_actors, check_cell
-from enact_dist.config import load_config
+from enact_dist.access.together import Together
+from enact_dist.actor.actor import Actor
+from enact_dist.actor.check import ActorDeclaration, check_actors, check_cell
+from enact_dist.config.read import load_config
 from enact_dist.terms import Aspect, Entities, Entity, View, World, Write, WriteEach
-from enact_dist.together import Together
 
 ONLINE = World("online")
 VIEWS, SYSTEM = Entities("view/*"), Entity("system")

@@ -7,13 +7,13 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from enact_dist.actor import Actor
-from enact_dist.actor_check import ActorDeclaration, declarations_of
-from enact_dist.actor_graph import graph_of, laid_out
-from enact_dist.actor_graph_svg import svg_of
-from enact_dist.actor_uses import uses_of
+from enact_dist.actor.actor import Actor
+from enact_dist.actor.check import ActorDeclaration, declarations_of
+from enact_dist.actor.drawing.graph import graph_of, laid_out
+from enact_dist.actor.drawing.svg import svg_of
+from enact_dist.actor.drawing.uses import uses_of
 from enact_dist.cli.main import main
-from enact_dist.config import load_config
+from enact_dist.config.read import load_config
 from enact_dist.terms import Aspect, Entities, Entity, Read, View, ViewEach, World, Write
 
 PALLETIZING = Path(__file__).parents[2] / "actors" / "palletizing" / "cell.toml"

@@ -5,10 +5,10 @@ import threading
 
 import pytest
 
-from enact_dist import supervise
-from enact_dist.actor_doing import Doing
-from enact_dist.actor_group import ANEW, ActorGroup
+from enact_dist.actor.running.doing import Doing
+from enact_dist.actor.running.group import ANEW, ActorGroup
 from enact_dist.link.log import JsonLines, TextLines
+from enact_dist.operate import supervise
 
 PATIENCE_S = 30.0
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, ClassVar
 
 import pytest
 
-from enact_dist.actor import Actor
-from enact_dist.actor_load import attributes_of, load_actor, make_actor, shown_values
+from enact_dist.actor.actor import Actor
+from enact_dist.actor.running.load import attributes_of, load_actor, make_actor, shown_values
 from enact_dist.errors import ConfigError
 from enact_dist.terms import Aspect, Entity, World, Write
 

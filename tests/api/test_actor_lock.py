@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from enact_dist.actor import Actor
-from enact_dist.actor_binding import BoundActor, joined
-from enact_dist.connecting import local
+from enact_dist.access.lock import Lock
+from enact_dist.access.trigger import Triggered
+from enact_dist.actor.actor import Actor
+from enact_dist.actor.binding import BoundActor, joined
 from enact_dist.errors import MisuseError, ReadonlyError
-from enact_dist.lock import Lock
-from enact_dist.lock_trigger import Triggered
 from enact_dist.terms import Aspect, Entities, Entity, Read, View, World, Write
+from enact_dist.world.connecting import local
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from enact_dist.actor_lock import ActorLock
+    from enact_dist.actor.lock import ActorLock
 
 pytestmark = pytest.mark.carrier("local", "drawn")
 

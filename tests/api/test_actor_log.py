@@ -6,16 +6,16 @@ import threading
 
 import pytest
 
-from enact_dist import actor_log
-from enact_dist.actor import Actor
-from enact_dist.actor_inbox import SetInbox
-from enact_dist.actor_log import KINDS_MAX, PAUSE_NS_MAX, PAUSE_NS_MIN, Repeated, kind_of
-from enact_dist.actor_runner import run_actor
-from enact_dist.actor_sets import PendingSets
-from enact_dist.connecting import local
+from enact_dist.access.together import Captured
+from enact_dist.actor import report
+from enact_dist.actor.actor import Actor
+from enact_dist.actor.inbox import SetInbox
+from enact_dist.actor.report import KINDS_MAX, PAUSE_NS_MAX, PAUSE_NS_MIN, Repeated, kind_of
+from enact_dist.actor.running.runner import run_actor
+from enact_dist.actor.sets import PendingSets
 from enact_dist.errors import SHARD_RESTARTED, LeaseLostError
 from enact_dist.terms import Aspect, Entity, World, Write
-from enact_dist.together import Captured
+from enact_dist.world.connecting import local
 
 
 def test_first_is_told_at_once_and_the_others_as_counts():
@@ -96,7 +96,7 @@ class Failing(Actor):
 
 def test_update_that_always_fails_is_one_traceback_and_a_count(caplog, monkeypatch):
     """Another error has its own traceback; every failure is in a line."""
-    monkeypatch.setattr(actor_log, "PAUSE_NS_MIN", 3_600_000_000_000)
+    monkeypatch.setattr(report, "PAUSE_NS_MIN", 3_600_000_000_000)
     stop = threading.Event()
     with local(worlds=["online"]) as cell, caplog.at_level(logging.WARNING, "enact.actor"):
         found = run_actor(Failing(7, stop), cell, stop=stop)

@@ -5,7 +5,7 @@ import threading
 import pytest
 
 from enact_dist import Actor, Aspect, Entity, World, Write, local
-from enact_dist.actor_runner import run_actor
+from enact_dist.actor.running.runner import run_actor
 from enact_dist.errors import PermissionDeniedError
 
 pytestmark = pytest.mark.carrier("auto")

@@ -10,8 +10,8 @@ import pytest
 from ports import free_port
 
 from enact_dist import Aspect, Durability, Entity, View, connect
-from enact_dist.actor_process import spawn_actor
-from enact_dist.actor_report import read_reports
+from enact_dist.actor.report import read_reports
+from enact_dist.actor.running.process import spawn_actor
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -8,7 +8,7 @@ import sys
 import msgpack
 import pytest
 
-from enact_dist.actor_report import (
+from enact_dist.actor.report import (
     ActorRecord,
     ActorStatistics,
     RateMeter,
@@ -16,7 +16,7 @@ from enact_dist.actor_report import (
     encode_reports,
     percentile,
 )
-from enact_dist.core.inspection import REPORT_BYTES_MAX
+from enact_dist.core.shard.inspection import REPORT_BYTES_MAX
 from enact_dist.errors import ProtocolError
 
 SECOND_NS = 1_000_000_000

@@ -8,14 +8,15 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from enact_dist import actor_binding, testing
-from enact_dist.actor import Actor
-from enact_dist.actor_binding import BoundActor
-from enact_dist.actor_inbox import Inbox, OwnWatch, Watching, watching
-from enact_dist.actor_process import ActorThread, actor_command
-from enact_dist.actor_report import decode_reports
-from enact_dist.actor_runner import run_actor
-from enact_dist.connecting import local
+from enact_dist import testing
+from enact_dist.access.lock import Lock
+from enact_dist.actor import binding as actor_binding
+from enact_dist.actor.actor import Actor
+from enact_dist.actor.binding import BoundActor
+from enact_dist.actor.inbox import Inbox, OwnWatch, Watching, watching
+from enact_dist.actor.report import decode_reports
+from enact_dist.actor.running.process import ActorThread, actor_command
+from enact_dist.actor.running.runner import run_actor
 from enact_dist.errors import (
     ChangedError,
     CommitUnknownError,
@@ -24,8 +25,8 @@ from enact_dist.errors import (
     MisuseError,
     ShardUnreachableError,
 )
-from enact_dist.lock import Lock
 from enact_dist.terms import Aspect, Entities, Entity, View, World, Write
+from enact_dist.world.connecting import local
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

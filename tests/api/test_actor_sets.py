@@ -8,8 +8,8 @@ from collections import Counter
 import pytest
 
 from enact_dist import Entity
-from enact_dist.actor_sets import PendingSets
-from enact_dist.together import Captured
+from enact_dist.access.together import Captured
+from enact_dist.actor.sets import PendingSets
 
 NAMES = ("left", "middle", "right")
 LEFT, MIDDLE, RIGHT = range(3)

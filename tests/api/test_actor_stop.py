@@ -4,9 +4,9 @@ import threading
 
 import pytest
 
-from enact_dist.actor import Actor
-from enact_dist.actor_runner import ActorRun
-from enact_dist.lock import Lock
+from enact_dist.access.lock import Lock
+from enact_dist.actor.actor import Actor
+from enact_dist.actor.running.runner import ActorRun
 from enact_dist.terms import Aspect, Entity, World, Write
 
 COUNT, BENCH = Aspect("count", int), Entity("bench")

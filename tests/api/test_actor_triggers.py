@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from enact_dist.actor_triggers import BackOff, FixedRate, PendingTriggers
+from enact_dist.actor.triggers import BackOff, FixedRate, PendingTriggers
 from enact_dist.terms import Entity
 
 A, B, C = Entity("view/a"), Entity("view/b"), Entity("view/c")

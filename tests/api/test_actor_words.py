@@ -5,7 +5,7 @@ import threading
 from types import SimpleNamespace
 
 from enact_dist import Actor, View
-from enact_dist.actor_words import ACTOR, WORDS, ListeningForWords, tell
+from enact_dist.actor.running.words import ACTOR, WORDS, ListeningForWords, tell
 
 
 def test_commands_of_sessions_that_are_gone_do_not_stay(cell):

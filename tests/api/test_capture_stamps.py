@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from enact_dist import testing
-from enact_dist.actor import Actor
-from enact_dist.actor_process import ActorThread
+from enact_dist.access.lock import Lock
+from enact_dist.access.together import Together
+from enact_dist.actor.actor import Actor
+from enact_dist.actor.running.process import ActorThread
 from enact_dist.errors import MisuseError
-from enact_dist.lock import Lock
 from enact_dist.terms import (
     Aspect,
     Entities,
@@ -21,7 +22,6 @@ from enact_dist.terms import (
     Write,
     WriteEach,
 )
-from enact_dist.together import Together
 
 IMAGE, POSE = Aspect("image", np.ndarray), Aspect("pose", int)
 LEFT, RIGHT = Entity("camera/left"), Entity("camera/right")

@@ -67,7 +67,7 @@ def test_second_cell_on_a_folder_is_refused_and_the_first_goes_on(tmp_path):
 
 def test_folder_is_free_again_when_opening_failed_half_way(tmp_path, monkeypatch):
     """A cell that could not be opened leaves its folder to the next one."""
-    from enact_dist.link import client
+    from enact_dist.link.client import locks as client
 
     with monkeypatch.context() as patch, pytest.raises(RuntimeError):
         patch.setattr(client, "CellClient", lambda *_, **__: (_ for _ in ()).throw(RuntimeError))

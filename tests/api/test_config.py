@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from enact_dist.config import load_config, parse_config
-from enact_dist.config_environment import carrier_of
-from enact_dist.core.messages import AspectEntry, Pin, ShardEntry
+from enact_dist.config.environment import carrier_of
+from enact_dist.config.read import load_config, parse_config
+from enact_dist.core.protocol.messages import AspectEntry, Pin, ShardEntry
 from enact_dist.errors import ConfigError
 from enact_dist.terms import Durability, Retention
 
@@ -331,7 +331,7 @@ def test_config_is_refused_with_line_and_reason(case):
 
 def test_load_config_names_the_file_when_it_is_missing(tmp_path):
     """A file that does not exist is a config error with its name."""
-    from enact_dist.config import load_config
+    from enact_dist.config.read import load_config
 
     with pytest.raises(ConfigError, match=r"cannot read .*nowhere.toml: No such file"):
         load_config(tmp_path / "nowhere.toml")
@@ -339,7 +339,7 @@ def test_load_config_names_the_file_when_it_is_missing(tmp_path):
 
 def test_load_config_reads_a_file_and_resolves_its_folders(tmp_path):
     """Folders are relative to the file, not to the working folder."""
-    from enact_dist.config import load_config
+    from enact_dist.config.read import load_config
 
     file = tmp_path / "cell.toml"
     file.write_text(FULL, encoding="utf-8")
@@ -352,7 +352,7 @@ def test_load_config_reads_a_file_and_resolves_its_folders(tmp_path):
 
 def test_load_config_refuses_a_file_that_is_not_text(tmp_path):
     """Bytes that are no UTF-8 are refused by name, not by a traceback."""
-    from enact_dist.config import load_config
+    from enact_dist.config.read import load_config
 
     file = tmp_path / "cell.toml"
     file.write_bytes(b'name = "\xff"\n')
@@ -430,7 +430,7 @@ def test_example_of_the_docstring_is_a_valid_cell():
     """The example that the module documents can be loaded as it stands."""
     import textwrap
 
-    import enact_dist.config as module
+    import enact_dist.config.read as module
 
     example = module.__doc__.split("Example::")[1].split("=====")[0]
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from enact_dist import Aspect, Entity, Lock, Write, local
+from enact_dist.compare.diff import DiffKind
 from enact_dist.comparing import Difference, Tolerance
-from enact_dist.diffing import DiffKind
 from enact_dist.errors import DatumTypeError, LockHeldError, MisuseError, UnknownWorldError
 
 pytestmark = pytest.mark.carrier("local", "drawn")
@@ -48,7 +48,7 @@ def training(cell):
 @pytest.fixture
 def fetched(monkeypatch):
     """The slots whose data were asked for."""
-    from enact_dist import sight
+    from enact_dist.compare import two_worlds as sight
 
     asked = []
 
@@ -172,7 +172,7 @@ def test_large_arrays_are_compared_where_they_differ(training, online):
 
 def test_data_are_fetched_some_at_a_time(training, online, fetched, monkeypatch):
     """No more than a batch of data, or one pair, is held at once."""
-    from enact_dist import diffing
+    from enact_dist.compare import diff as diffing
 
     monkeypatch.setattr(diffing, "BATCH_BYTES_MAX", 2_000_000)
     sizes = []

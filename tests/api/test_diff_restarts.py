@@ -5,10 +5,10 @@ import pytest
 from ports import free_endpoint
 
 from enact_dist import Aspect, Durability, Entity, Lock, Tolerance, Write, connect
-from enact_dist.core.messages import PlacementMap, ShardEntry
-from enact_dist.core.shard_state import ShardSettings
+from enact_dist.core.protocol.messages import PlacementMap, ShardEntry
+from enact_dist.core.shard.state import ShardSettings
 from enact_dist.errors import ForgottenError
-from enact_dist.link.shard_daemon import DaemonSettings, start_shard
+from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
 
 SHIFT = Aspect("shift_mm", float, compare=Tolerance(absolute=0.5))
 SEEN = Aspect("seen", np.ndarray, Durability.VOLATILE)
@@ -73,7 +73,7 @@ def test_watch_of_a_diff_outlives_a_restart(cell, restart):
 
 def test_diff_after_a_restart_takes_a_new_look(cell, restart, monkeypatch):
     """A shard that restarts between the cut and its data costs another cut, and no error."""
-    from enact_dist import sight
+    from enact_dist.compare import two_worlds as sight
 
     large = Aspect("large", np.ndarray)
     training, online = cell.world("training"), cell.world("online")

@@ -99,7 +99,7 @@ def test_standing_diff_follows_only_what_it_names(training, online):
 @pytest.mark.parametrize("against", ["present", "past"])
 def test_what_was_told_is_compared_once(training, online, monkeypatch, against):
     """The first look covers what the watch lists; it is not fetched and compared again."""
-    from enact_dist import diff_watch
+    from enact_dist.compare import watch_diff as diff_watch
 
     looks = []
     compared = diff_watch.compared
@@ -142,7 +142,7 @@ def test_slow_reader_gets_the_newest_and_knows_what_it_missed(training, online, 
 
 def test_error_loses_no_change(training, online, monkeypatch):
     """What could not be looked at is looked at by the next call."""
-    from enact_dist import diff_watch
+    from enact_dist.compare import watch_diff as diff_watch
 
     with training.watch_diff(online) as watch:
         in_sight = diff_watch.both_in_sight
@@ -219,7 +219,7 @@ def test_past_context_is_a_reference_that_stays(online):
         assert told(watch, 0) == ("bench", "only left")
         assert told(watch, 0) is None
     with pytest.raises(MisuseError, match="never change"):
-        from enact_dist.diff_watch import DiffWatch
+        from enact_dist.compare.watch_diff import DiffWatch
 
         DiffWatch(before, before, "**", ())
 

@@ -19,7 +19,7 @@ from enact_dist import (
     ViewEach,
     Write,
 )
-from enact_dist.core.messages import DropWorld, Fork
+from enact_dist.core.protocol.messages import DropWorld, Fork
 from enact_dist.errors import (
     ForgottenError,
     LockHeldError,
@@ -27,7 +27,7 @@ from enact_dist.errors import (
     ShardUnreachableError,
     UnknownWorldError,
 )
-from enact_dist.link.session_client import SessionClient
+from enact_dist.link.client.session import SessionClient
 
 pytestmark = pytest.mark.carrier("local", "drawn")
 
@@ -238,7 +238,7 @@ def deaf(two_shards, monkeypatch):
     def block():
         client = two_shards.cell._client
         with monkeypatch.context() as patch:
-            patch.setattr("enact_dist.forking.FINISH_S", 0.5)
+            patch.setattr("enact_dist.world.forks.FINISH_S", 0.5)
             patch.setattr(client, "carrier", DeafCarrier(client.carrier, Fork, DropWorld))
             yield
 
@@ -247,7 +247,7 @@ def deaf(two_shards, monkeypatch):
 
 def test_nothing_is_forked_or_dropped_while_a_shard_is_away(two_stored, monkeypatch):
     """Whoever is away is named before anybody begins."""
-    monkeypatch.setattr("enact_dist.link.session_client.SessionClient.call_all", _in_a_second)
+    monkeypatch.setattr("enact_dist.link.client.session.SessionClient.call_all", _in_a_second)
     cell, online = two_stored.cell, two_stored.cell.world("online")
     put(online, LEFT, 1)
     what_if = online.fork("what_if")

@@ -193,7 +193,7 @@ def test_history_beyond_one_answer_comes_in_several(cell, online, monkeypatch):
         put(online, LEG, number)
     cell.keep("label", online.history(ARM, COUNT)[:7])
     cell.keep("label", online.history(LEG, COUNT)[2:8])
-    monkeypatch.setattr("enact_dist.core.pages.PAGE_BYTES_MAX", 2_000)
+    monkeypatch.setattr("enact_dist.core.protocol.pages.PAGE_BYTES_MAX", 2_000)
 
     versions = online.history(ARM, COUNT)
 

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from enact_dist import Aspect, Durability, Entity, Lock, Read, View, Write
-from enact_dist.core.client import Client
-from enact_dist.core.datum import Datum
-from enact_dist.link.client import CellClient
-from enact_dist.link.datum_cache import DatumCache
-from enact_dist.link.memory import leftovers
-from enact_dist.session import Session
+from enact_dist.access.session import Session
+from enact_dist.core.client.client import Client
+from enact_dist.core.protocol.datum import Datum
+from enact_dist.link.client.fetch import DatumCache
+from enact_dist.link.client.locks import CellClient
+from enact_dist.link.memory.maps import leftovers
 
 piece, bench = Entity("work_piece"), Entity("work_bench")
 CLOUD = Aspect("cloud", np.ndarray, Durability.VOLATILE, retention=1)

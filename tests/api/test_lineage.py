@@ -18,8 +18,8 @@ from enact_dist import (
     WriteEach,
 )
 from enact_dist.errors import ForgottenError, MisuseError, NullDatumError, UnknownWorldError
-from enact_dist.lineage import DEPTH_MAX, EffectTree
 from enact_dist.testing import ManualClock, run_once, worlds
+from enact_dist.world.lineage import DEPTH_MAX, EffectTree
 
 pytestmark = pytest.mark.carrier("local", "drawn")
 
@@ -383,7 +383,7 @@ def test_answers_that_would_be_too_long_lose_nothing_silently(cell, online, monk
         with Lock(each, source) as lock:
             lock[each][Entity(f"part/{number}")] = lock[source]
     added(online, *(Read(online, Entity(f"part/{number}"), COUNT) for number in range(5)))
-    monkeypatch.setattr("enact_dist.core.pages.PAGE_BYTES_MAX", 1_000)
+    monkeypatch.setattr("enact_dist.core.protocol.pages.PAGE_BYTES_MAX", 1_000)
 
     why, impact = cell.why("online", total, SUM), cell.impact("online", here, COUNT)
 

@@ -5,9 +5,9 @@ import socket
 import pytest
 
 from enact_dist import Aspect, Durability, Entity, Lock, Read, View, Write, connect
-from enact_dist.core.messages import Pin, PlacementMap, ShardEntry
-from enact_dist.core.shard_state import ShardSettings
-from enact_dist.link.shard_daemon import DaemonSettings, start_shard
+from enact_dist.core.protocol.messages import Pin, PlacementMap, ShardEntry
+from enact_dist.core.shard.state import ShardSettings
+from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
 
 COUNT = Aspect("count", int)
 SUM = Aspect("sum", int)

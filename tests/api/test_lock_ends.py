@@ -20,9 +20,9 @@ from enact_dist import (
     ViewEach,
     Write,
     WriteEach,
-    lock,
 )
-from enact_dist.core.messages import Acquire, Commit
+from enact_dist.access import lock
+from enact_dist.core.protocol.messages import Acquire, Commit
 from enact_dist.errors import (
     CommitUnknownError,
     LeaseLostError,
@@ -31,7 +31,7 @@ from enact_dist.errors import (
     LockTimeoutError,
     MisuseError,
 )
-from enact_dist.link import lanes
+from enact_dist.link.client import lanes
 
 pytestmark = pytest.mark.carrier("local", "drawn")
 

@@ -6,10 +6,18 @@ import threading
 import pytest
 
 from enact_dist import Aspect, Entity, Lock, View, Write
-from enact_dist.core.messages import Acquire, Commit, Fenced, Fetch, Outcome, Release, Validate
+from enact_dist.core.protocol.messages import (
+    Acquire,
+    Commit,
+    Fenced,
+    Fetch,
+    Outcome,
+    Release,
+    Validate,
+)
 from enact_dist.errors import CommitUnknownError
-from enact_dist.link import client as link_client
-from enact_dist.link.lanes import KEPT_MAX, Lanes
+from enact_dist.link.client import locks as link_client
+from enact_dist.link.client.lanes import KEPT_MAX, Lanes
 
 pytestmark = pytest.mark.carrier("local", "drawn")
 

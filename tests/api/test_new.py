@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from enact_dist import Aspect, Durability, Entity, Lock, Read, View, Write
 from enact_dist.errors import DatumTypeError, LockReleasedError, MisuseError, ReadonlyError
-from enact_dist.link.memory import leftovers
+from enact_dist.link.memory.maps import leftovers
 
 piece = Entity("work_piece")
 CARRIERS = pytest.mark.carrier("local", "socket", "zenoh")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from enact_dist import Aspect, Durability, Entity, Lock, View, Write
-from enact_dist.link.memory import leftovers
+from enact_dist.link.memory.maps import leftovers
 
 CLOUD = Aspect("cloud", np.ndarray, Durability.VOLATILE)
 CARRIERS = pytest.mark.carrier("local", "socket", "zenoh")

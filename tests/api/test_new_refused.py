@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from enact_dist import Aspect, Durability, Entity, Lock, Read, Write, writing
+from enact_dist import Aspect, Durability, Entity, Lock, Read, Write
+from enact_dist.access import writes as writing
 from enact_dist.errors import MisuseError
 
 piece, bench = Entity("work_piece"), Entity("work_bench")

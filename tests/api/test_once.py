@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 
 from enact_dist import testing
-from enact_dist.actor import Actor
-from enact_dist.actor_process import ActorThread
-from enact_dist.actor_runner import run_actor
+from enact_dist.access.lock import Lock
+from enact_dist.actor.actor import Actor
+from enact_dist.actor.outcome import Outcome
+from enact_dist.actor.running.process import ActorThread
+from enact_dist.actor.running.runner import run_actor
 from enact_dist.errors import LeaseLostError, LockTimeoutError, MisuseError
-from enact_dist.lock import Lock
-from enact_dist.outcome import Outcome
 from enact_dist.terms import (
     Aspect,
     Durability,
@@ -223,7 +223,7 @@ def test_motion_whose_writes_are_refused_for_good_has_failed_and_the_actor_goes_
     cell, online, monkeypatch
 ):
     """What is more than one lock may write does not end the actor, nor leave the version taken."""
-    robot = Robot(lambda _: monkeypatch.setattr("enact_dist.writing.BODY_BYTES_MAX", 10_000))
+    robot = Robot(lambda _: monkeypatch.setattr("enact_dist.access.writes.BODY_BYTES_MAX", 10_000))
     with ActorThread(robot, cell) as thread:
         write(online, PLAN, ["x" * 20_000])
         failed = until(online, "failed")
@@ -394,7 +394,7 @@ import os, sys, threading
 from pathlib import Path
 sys.path.insert(0, sys.argv[3])
 from enact_dist import Actor, Aspect, Entity, View, World, Write, connect, run_actor
-from enact_dist.outcome import Outcome
+from enact_dist.actor.outcome import Outcome
 
 class Robot(Actor):
     plan = View(World("online"), Entity("robot"), Aspect("plan", list))

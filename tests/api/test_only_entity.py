@@ -16,9 +16,9 @@ from enact_dist import (
     local,
     testing,
 )
-from enact_dist.actor_binding import BoundActor
-from enact_dist.actor_check import ActorDeclaration, check_actors
-from enact_dist.actor_process import ActorThread, actor_command
+from enact_dist.actor.binding import BoundActor
+from enact_dist.actor.check import ActorDeclaration, check_actors
+from enact_dist.actor.running.process import ActorThread, actor_command
 from enact_dist.errors import MisuseError
 
 CAMERAS = Entities("camera/*")

@@ -20,7 +20,7 @@ from enact_dist import (
     ViewEach,
     Write,
 )
-from enact_dist.core.messages import TakeView
+from enact_dist.core.protocol.messages import TakeView
 from enact_dist.errors import (
     ClockSkewError,
     ForgottenError,
@@ -347,7 +347,7 @@ def test_making_a_past_context_asks_nobody_and_a_view_asks_each_shard_once(two_s
 
 
 def _keep_alive():
-    from enact_dist.core.messages import KeepAlive
+    from enact_dist.core.protocol.messages import KeepAlive
 
     return KeepAlive
 

@@ -19,7 +19,7 @@ from enact_dist import (
     WriteEach,
     testing,
 )
-from enact_dist.core.datum import Position
+from enact_dist.core.protocol.datum import Position
 from enact_dist.errors import (
     ChangedError,
     DatumTypeError,
@@ -176,8 +176,8 @@ def test_view_that_finds_no_moment_waits_for_locks_and_says_who_holds_them(two_s
     cell = two_shards.cell
     online, left, right = cell.world("online"), Entity("left/arm"), Entity("right/arm")
     held, done = threading.Event(), threading.Event()
-    monkeypatch.setattr("enact_dist.core.multilock.ROUNDS_MAX", 0)
-    monkeypatch.setattr("enact_dist.core.cuts.Cut.settled", lambda *_, **__: None)
+    monkeypatch.setattr("enact_dist.core.client.lock.ROUNDS_MAX", 0)
+    monkeypatch.setattr("enact_dist.core.client.cut.Cut.settled", lambda *_, **__: None)
     monkeypatch.setattr(cell._client, "patience_s", 1.0)
 
     def hold() -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from enact_dist import testing
-from enact_dist.actor import Actor
+from enact_dist.access.lock import Lock
+from enact_dist.actor.actor import Actor
 from enact_dist.errors import LeaseLostError, MisuseError, NullDatumError, UnknownWorldError
-from enact_dist.lock import Lock
 from enact_dist.terms import (
     Aspect,
     Entities,

@@ -34,16 +34,16 @@ from enact_dist import (
     Write,
     testing,
 )
-from enact_dist.actor import Actor
-from enact_dist.actor_binding import BoundActor
-from enact_dist.actor_check import check_cell
-from enact_dist.actor_inbox import SetInbox, Watching
-from enact_dist.actor_process import ActorThread
-from enact_dist.config import load_config
-from enact_dist.core.datum import Position
+from enact_dist.access.together import captured_versions
+from enact_dist.access.watch import Change
+from enact_dist.actor.actor import Actor
+from enact_dist.actor.binding import BoundActor
+from enact_dist.actor.check import check_cell
+from enact_dist.actor.inbox import SetInbox, Watching
+from enact_dist.actor.running.process import ActorThread
+from enact_dist.config.read import load_config
+from enact_dist.core.protocol.datum import Position
 from enact_dist.errors import MisuseError, NotRequestedError, NullDatumError
-from enact_dist.together import captured_versions
-from enact_dist.watch import Change
 
 pytestmark = pytest.mark.carrier("local", "drawn")
 

@@ -22,8 +22,8 @@ from enact_dist import (
     View,
     Write,
 )
-from enact_dist.actor import Actor
-from enact_dist.actor_process import ActorThread
+from enact_dist.actor.actor import Actor
+from enact_dist.actor.running.process import ActorThread
 
 pytestmark = pytest.mark.carrier("local", "drawn")
 TICKS = 12

@@ -5,12 +5,12 @@ import threading
 import pytest
 
 from enact_dist import testing
-from enact_dist.actor import Actor
-from enact_dist.actor_process import ActorThread
+from enact_dist.access.lock import Lock
+from enact_dist.access.together import Together
+from enact_dist.actor.actor import Actor
+from enact_dist.actor.running.process import ActorThread
 from enact_dist.errors import MisuseError, NullDatumError
-from enact_dist.lock import Lock
 from enact_dist.terms import Aspect, Entity, View, World, Write
-from enact_dist.together import Together
 
 ONLINE = World("online")
 SIDES = [Entity(f"camera/{side}") for side in ("left", "middle", "right")]

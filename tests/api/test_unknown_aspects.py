@@ -15,7 +15,7 @@ from enact_dist import (
     Write,
     local,
 )
-from enact_dist.core.datum import Slot
+from enact_dist.core.protocol.datum import Slot
 from enact_dist.errors import DatumTypeError, MisuseError, NullDatumError
 
 PLAN = Aspect("plan", list[float])

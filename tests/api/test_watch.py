@@ -5,8 +5,8 @@ import threading
 import pytest
 
 from enact_dist import Aspect, Entities, Entity, Lock, Write
-from enact_dist.core import pages
-from enact_dist.core.messages import START, Survey
+from enact_dist.core.protocol import pages
+from enact_dist.core.protocol.messages import START, Survey
 from enact_dist.errors import MisuseError
 from enact_dist.link import notices
 

@@ -7,11 +7,11 @@ import pytest
 from ports import free_endpoint
 
 from enact_dist import Actor, Lock, World, connect
-from enact_dist.actor_process import ActorThread
-from enact_dist.core.messages import Pin, PlacementMap, ShardEntry
-from enact_dist.core.shard_state import ShardSettings
-from enact_dist.link.rebalance import rebalance
-from enact_dist.link.shard_daemon import DaemonSettings, start_shard
+from enact_dist.actor.running.process import ActorThread
+from enact_dist.core.protocol.messages import Pin, PlacementMap, ShardEntry
+from enact_dist.core.shard.state import ShardSettings
+from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
+from enact_dist.link.offline.rebalance import rebalance
 from enact_dist.recording import Recorder
 from enact_dist.recording.reading import Recording
 from enact_dist.terms import Aspect, Durability, Entities, Entity, View, Write
@@ -65,7 +65,7 @@ class GrowingCell:
 def growing(tmp_path, monkeypatch, carrier):
     """A cell of one stored shard that can get a second one; leases are short."""
     monkeypatch.setenv("ENACT_SHARED_FOLDER", str(tmp_path))
-    monkeypatch.setattr("enact_dist.connecting.TTL_S", 0.4)
+    monkeypatch.setattr("enact_dist.world.connecting.TTL_S", 0.4)
     cell = GrowingCell(tmp_path, carrier)
     yield cell
     cell.stop()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from enact_dist import Aspect, Entities, Entity, Lock, Read, View, ViewEach, Write
-from enact_dist.core.messages import Fetch, Gone, KeepAlive, Release, TakeView
+from enact_dist.core.protocol.messages import Fetch, Gone, KeepAlive, Release, TakeView
 from enact_dist.errors import (
     DatumTypeError,
     LeaseLostError,

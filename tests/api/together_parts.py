@@ -18,9 +18,9 @@ from enact_dist import (
     connect,
     local,
 )
-from enact_dist.core.messages import Pin, PlacementMap, ShardEntry
-from enact_dist.core.shard_state import ShardSettings
-from enact_dist.link.shard_daemon import DaemonSettings, start_shard
+from enact_dist.core.protocol.messages import Pin, PlacementMap, ShardEntry
+from enact_dist.core.shard.state import ShardSettings
+from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
 
 PATIENCE_S = 30.0
 KEPT = 4

@@ -22,9 +22,9 @@ from enact_dist.bench.layers import (
 )
 from enact_dist.bench.payloads import entity, fetch, floats, store
 from enact_dist.bench.updates import slots, update
-from enact_dist.core.messages import Acquire, Commit, Committed, Granted
-from enact_dist.core.shard import Shard
-from enact_dist.link.client import CellClient
+from enact_dist.core.protocol.messages import Acquire, Commit, Committed, Granted
+from enact_dist.core.shard.shard import Shard
+from enact_dist.link.client.locks import CellClient
 
 
 @pytest.fixture

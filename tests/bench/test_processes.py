@@ -19,7 +19,7 @@ from enact_dist.bench.pipeline_worker import (
 from enact_dist.bench.place import EMBEDDED, Place, environment
 from enact_dist.bench.run import Run
 from enact_dist.bench.updates import slots, update
-from enact_dist.core.datum import Slot
+from enact_dist.core.protocol.datum import Slot
 from enact_dist.errors import MisuseError
 
 

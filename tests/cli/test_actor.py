@@ -4,11 +4,12 @@ import signal
 
 import pytest
 
-from enact_dist import supervise
 from enact_dist.cli import up
-from enact_dist.config import load_config
+from enact_dist.config.read import load_config
 from enact_dist.errors import LinkError
-from enact_dist.link import endpoints, shard_daemon
+from enact_dist.link.daemon import daemon as shard_daemon
+from enact_dist.link.zenoh import endpoints
+from enact_dist.operate import supervise
 
 MODULE = """\
 from enact_dist import Actor, Aspect, Entity, Entities, View, World, Write
@@ -123,7 +124,7 @@ def test_an_actor_of_another_host_with_the_number_of_this_process_is_listed(
     words = ("my_actors:Beat", "--world", "online=training")
     actor = spawn("actor", "run", *words, "--cell", cell_file)
     until(actor, "ready: actor Beat")
-    monkeypatch.setattr("enact_dist.link.zenoh_config._used_in", set())  # else this were a child
+    monkeypatch.setattr("enact_dist.link.zenoh.config._used_in", set())  # else this were a child
     monkeypatch.setattr("os.getpid", lambda: actor.pid)
     monkeypatch.setattr("socket.gethostname", lambda: "another")
 

@@ -10,10 +10,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from enact_dist.actor_report import ActorStatistics
-from enact_dist.cell_info import ActorInfo
-from enact_dist.cli.actor import _losses
-from enact_dist.cli.actor_run import _warn_of_namesakes
+from enact_dist.actor.report import ActorStatistics
+from enact_dist.cli.actor.actor import _losses
+from enact_dist.cli.actor.run import _warn_of_namesakes
+from enact_dist.world.listings import ActorInfo
 
 MODULE = """\
 from enact_dist import Actor, Aspect, Entity, World, Write

@@ -16,9 +16,9 @@ from enact_dist import Aspect, Entity, Lock, View, connect
 from enact_dist.bench import command, history, updates
 from enact_dist.bench.place import Place
 from enact_dist.bench.visit import PEAK_BYTES, Visit, without_room
-from enact_dist.cell_info import ShardInfo
 from enact_dist.cli import bench
 from enact_dist.errors import EnactError, LinkError, ShardUnreachableError
+from enact_dist.world.listings import ShardInfo
 
 FIELDS = ["name", "variant", "median_us", "p99_us", "n", "ratio", "goal", "met"]
 SHORT = ("--seconds", "0.03")

@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import pytest
 
-from enact_dist import doctor
-from enact_dist.cell_info import ShardInfo
-from enact_dist.config import load_config
-from enact_dist.core.epochs import unkept_epoch
-from enact_dist.core.messages import AspectEntry, Welcome
-from enact_dist.doctor import Level
-from enact_dist.doctor_cell import data_folder, differences
+from enact_dist.config.read import load_config
+from enact_dist.core.protocol.messages import AspectEntry, Welcome
+from enact_dist.core.state.clock import unkept_epoch
+from enact_dist.operate import doctor
+from enact_dist.operate.doctor import Level
+from enact_dist.operate.doctor_cell import data_folder, differences
+from enact_dist.world.listings import ShardInfo
 
 
 def test_python_older_than_3_11_fails():
@@ -250,7 +250,7 @@ def test_shard_without_the_folder_of_its_file_and_another_durability_are_told(tm
 @pytest.mark.carrier("auto")
 def test_way_to_a_shard_is_found_out_before_it_is_told(enact, cell_file, monkeypatch):
     """Both shards offer a socket; a cell that is joined has met one of them only."""
-    monkeypatch.setattr("enact_dist.link.socket_line.CONNECT_S", 30.0)
+    monkeypatch.setattr("enact_dist.link.socket.line.CONNECT_S", 30.0)
     findings = enact("doctor", "--cell", cell_file, "--json").json
     shards = enact("shard", "ls", "--cell", cell_file, "--json").json
 

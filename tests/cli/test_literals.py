@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from enact_dist.cli import literals
+from enact_dist.cli.text import literals
 from enact_dist.errors import ConfigError, DatumTypeError, MisuseError
 from enact_dist.wire.fingerprint import fingerprint
 

@@ -219,3 +219,34 @@ def test_help_loads_neither_zenoh_nor_open3d_nor_rich():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
+
+
+@pytest.mark.parametrize(
+    "words", [["--help"], ["--version"], ["nonsense"], ["--debug", "up", "-h"]]
+)
+def test_command_line_loads_only_the_command_that_it_names(words):
+    """The overview loads none of them: it takes as long as the interpreter needs to start."""
+    code = (
+        "import sys; from enact_dist.cli.main import main\n"
+        "try: main(sys.argv[1:])\n"
+        "except SystemExit: pass\n"
+        "from enact_dist.cli.verbs import NOUNS\n"
+        "modules = {noun.module for noun in NOUNS.values()}\n"
+        "print(*(name for name in modules if f'enact_dist.cli.{name}' in sys.modules))\n"
+        "print(*sorted({'numpy', 'msgpack', 'logging', 'asyncio'} & set(sys.modules)))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words], capture_output=True, text=True, check=True
+    )
+
+    commands, slow = done.stdout.split("\n")[-3:-1]
+    assert commands == ("up" if "up" in words else "")
+    assert commands or not slow
+
+
+def test_overview_says_of_each_command_what_its_own_help_says(capsys):
+    """The summaries stand once, in the order of the table."""
+    with pytest.raises(SystemExit):
+        main(["--help"])
+
+    assert capsys.readouterr().out == build_parser().format_help()

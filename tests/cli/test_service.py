@@ -9,10 +9,11 @@ import threading
 
 import pytest
 
-from enact_dist import Aspect, Entity, Lock, Write, connect, supervise
+from enact_dist import Aspect, Entity, Lock, Write, connect
 from enact_dist.cli.main import main
 from enact_dist.errors import EnactError, LockTimeoutError
-from enact_dist.link import client as link_client
+from enact_dist.link.client import locks as link_client
+from enact_dist.operate import supervise
 
 COUNT = Aspect("count", int)
 ACTOR = """\

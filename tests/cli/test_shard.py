@@ -5,7 +5,7 @@ import signal
 
 import pytest
 
-from enact_dist.link.store import open_store
+from enact_dist.link.store.store import open_store
 
 
 def test_ls_lists_every_shard(enact, cell_file):

@@ -4,9 +4,9 @@ import signal
 
 import pytest
 
-from enact_dist.core.messages import PlacementMap, ShardEntry
-from enact_dist.core.shard_state import ShardSettings
-from enact_dist.link.shard_daemon import DaemonSettings, start_shard
+from enact_dist.core.protocol.messages import PlacementMap, ShardEntry
+from enact_dist.core.shard.state import ShardSettings
+from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
 
 
 @pytest.fixture
@@ -118,7 +118,7 @@ def test_checks_load_no_tables_and_no_arrays():
     code = (
         "import sys; from enact_dist.cli.main import main;"
         "main(['shard', 'check', '--cell', 'tcp/127.0.0.1:9', '--timeout', '0.1']);"
-        "print(sorted({'rich', 'numpy', 'open3d', 'enact_dist.lock', 'enact_dist.core.shard'}"
+        "print(sorted({'rich', 'numpy', 'open3d', 'enact_dist.access.lock', 'enact_dist.core.shard.shard'}"
         " & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

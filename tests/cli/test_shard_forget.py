@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from enact_dist import Aspect, Durability, Entity, Lock, Write, local
-from enact_dist.core.messages import AspectEntry
-from enact_dist.core.records import AspectRecord, Persist, WorldRecord
+from enact_dist.core.protocol.messages import AspectEntry
+from enact_dist.core.protocol.records import AspectRecord, Persist, WorldRecord
 from enact_dist.errors import LinkError
-from enact_dist.link.store import open_store
+from enact_dist.link.store.store import open_store
 
 NUMBER, CLOUD = Aspect("number", int), Aspect("cloud", np.ndarray, Durability.OS)
 

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from enact_dist.cli import showing
+from enact_dist.cli.text import showing
 from enact_dist.errors import ConfigError
 
 DATUM = {

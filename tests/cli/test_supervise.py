@@ -11,9 +11,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from enact_dist import supervise
 from enact_dist.link.log import says_ready
-from enact_dist.supervise import Supervisor, Task
+from enact_dist.operate import supervise
+from enact_dist.operate.supervise import Supervisor, Task
 
 
 def task(name, kind, code):
@@ -316,11 +316,11 @@ def test_pids_name_the_running_children():
 def test_child_ends_when_its_supervisor_was_killed(tmp_path):
     """Even kill -9 of the supervisor leaves no child behind."""
     child = (
-        "from enact_dist.supervise import end_with_supervisor; end_with_supervisor();"
+        "from enact_dist.operate.supervise import end_with_supervisor; end_with_supervisor();"
         "import os, signal; print('ready:', os.getpid()); signal.pause()"
     )
     code = (
-        "import sys, threading; from enact_dist.supervise import Supervisor, Task;"
+        "import sys, threading; from enact_dist.operate.supervise import Supervisor, Task;"
         f"Supervisor([Task('x', 'shard', (sys.executable, '-c', {child!r}))],"
         "lambda name, line: print(line, flush=True)).run(threading.Event())"
     )

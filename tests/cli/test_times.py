@@ -6,10 +6,10 @@ from datetime import UTC, datetime
 
 import pytest
 
+from enact_dist.access.arguments import stamp_of
 from enact_dist.cli.main import build_parser
-from enact_dist.cli.times import moment, shown_position
-from enact_dist.core.datum import Position
-from enact_dist.moments import stamp_of
+from enact_dist.cli.text.times import moment, shown_position
+from enact_dist.core.protocol.datum import Position
 
 NOON_NS = 1_763_726_400_000_000_000
 ROUNDED_S = 0.001

@@ -1,7 +1,7 @@
 """`enact verify`: what it prints, what a failure looks like, how it ends."""
 
 from enact_dist.cli.main import main
-from enact_dist.core.commits import Commits
+from enact_dist.core.state.commits import Commits
 from enact_dist.verify.simulation.series import run_series
 
 

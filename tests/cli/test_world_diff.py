@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from enact_dist import Aspect, Difference, Entity, Lock, Write, connect
-from enact_dist.reading import slot_of
+from enact_dist.access.reads import slot_of
 
 VOCABULARY = """\
 from dataclasses import dataclass
@@ -240,7 +240,7 @@ def test_contexts_are_seen_at_one_moment_over_both_shards(cell, writer):
 
 def test_comparing_holds_no_lock_where_there_is_no_cut(cell, cell_file, writer, monkeypatch):
     """Locks that stand in for a cut are given back before the first datum is compared."""
-    monkeypatch.setattr("enact_dist.core.multilock.ROUNDS_MAX", 0)
+    monkeypatch.setattr("enact_dist.core.client.lock.ROUNDS_MAX", 0)
     held = []
 
     def looked_at(left, right):

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import pytest
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
-from enact_dist.cli.times import moment
-from enact_dist.moments import stamp_of
+from enact_dist.access.arguments import stamp_of
+from enact_dist.cli.text.times import moment
 
 COUNT = Aspect("time_count", int)
 ARM, LEG = Entity("arm"), Entity("system/leg")

@@ -8,8 +8,8 @@ import pytest
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
 from enact_dist.cli.main import build_parser
-from enact_dist.cli.rates import WINDOW_S, Rates, Sample
-from enact_dist.core.datum import Slot
+from enact_dist.cli.text.rates import WINDOW_S, Rates, Sample
+from enact_dist.core.protocol.datum import Slot
 
 POSE = Aspect("pose_mm", list)
 IMAGE = Aspect("picture", np.ndarray)
@@ -95,7 +95,7 @@ def test_a_deleted_datum_is_null(spawn, until, commit, cell_file):
 def test_a_version_that_is_gone_is_said_to_be_gone(monkeypatch, watch, commit):
     """Nothing else takes its place."""
     commit("late", POSE, [1.0])
-    monkeypatch.setattr("enact_dist.cli.world_watch.found_of", lambda *_: {})
+    monkeypatch.setattr("enact_dist.cli.world.watch.found_of", lambda *_: {})
 
     text = watch("late", "--data", "--count", "1").out
     fact = json.loads(watch("late", "--data", "--count", "1", "--json").out)

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 from shard_bench import MS, TTL_NS, S, ShardBench, datum
 
-from enact_dist.core.client import Client
-from enact_dist.core.messages import (
+from enact_dist.core.client.client import Client
+from enact_dist.core.protocol.messages import (
     Answer,
     Item,
     KeepAlive,
@@ -19,13 +19,13 @@ from enact_dist.core.messages import (
     ShardEntry,
     WriteItem,
 )
-from enact_dist.core.placement import shard_of
+from enact_dist.core.protocol.placement import shard_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from enact_dist.core.datum import Slot
-    from enact_dist.core.multilock import MultiLock
+    from enact_dist.core.client.lock import MultiLock
+    from enact_dist.core.protocol.datum import Slot
 
 REQUEST, ANSWER, NOTHING = "request", "answer", "nothing"
 

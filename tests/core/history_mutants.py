@@ -8,9 +8,9 @@ from __future__ import annotations
 from bisect import bisect_left
 from operator import attrgetter
 
-from enact_dist.core.history import History
-from enact_dist.core.slot_history import SlotHistory
-from enact_dist.core.slots import SlotMap
+from enact_dist.core.state.history import History
+from enact_dist.core.state.slot_history import SlotHistory
+from enact_dist.core.state.slots import SlotMap
 
 LATE_NS = 2_000_000_000
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from shard_bench import ShardBench, item, lock_id, slot
 
-from enact_dist.core.datum import Datum
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.datum import Datum
+from enact_dist.core.protocol.messages import (
     AspectEntry,
     Commit,
     Item,

@@ -8,7 +8,7 @@ from pathlib import Path
 from hypothesis import strategies as st
 from shard_bench import MS, S
 
-from enact_dist.core.messages import AspectEntry
+from enact_dist.core.protocol.messages import AspectEntry
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "api"))
 

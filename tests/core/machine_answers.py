@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import singledispatch
 
-from enact_dist.core import messages, records
+from enact_dist.core.protocol import messages, records
 
 
 def _text(datum):

@@ -34,9 +34,8 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from reference_time import Nothing, Past, Place, TimeModel  # found by what `history_steps` added
 from shard_bench import MS, S, ShardBench, lock_id
 
-from enact_dist.core.datum import Datum, Position, Slot
-from enact_dist.core.message_parts import CAUSE_COMMIT, CAUSE_FORK
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.datum import Datum, Position, Slot
+from enact_dist.core.protocol.messages import (
     Commit,
     Committed,
     DatumRead,
@@ -64,7 +63,8 @@ from enact_dist.core.messages import (
     Viewed,
     WriteItem,
 )
-from enact_dist.core.records import SlotRecord, Tick
+from enact_dist.core.protocol.parts import CAUSE_COMMIT, CAUSE_FORK
+from enact_dist.core.protocol.records import SlotRecord, Tick
 from enact_dist.terms import Access
 
 

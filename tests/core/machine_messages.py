@@ -15,8 +15,8 @@ from reference_parts import CAPTURED_NS, captured_of
 from reference_table import lines_of
 from shard_bench import datum
 
-from enact_dist.core.datum import LockId, Position, Slot, Token
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.datum import LockId, Position, Slot, Token
+from enact_dist.core.protocol.messages import (
     Acquire,
     Break,
     Commit,
@@ -39,7 +39,7 @@ from enact_dist.core.messages import (
     Validate,
     WriteItem,
 )
-from enact_dist.core.records import Called
+from enact_dist.core.protocol.records import Called
 from enact_dist.terms import Access
 
 if TYPE_CHECKING:

@@ -8,19 +8,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from enact_dist.core.commits import Commits
-from enact_dist.core.decisions import Decisions
-from enact_dist.core.history import History
-from enact_dist.core.lock_desk import LockDesk
-from enact_dist.core.messages import Fenced, Finished, Prepared
-from enact_dist.core.prepares import PrepareDesk
-from enact_dist.core.records import Persist, Reply
-from enact_dist.core.session_desk import SessionDesk
-from enact_dist.core.sessions import Session, SessionTable
-from enact_dist.core.slots import Content, SlotMap
-from enact_dist.core.stamps import Stamps
-from enact_dist.core.tenures import Tenure, Tenures
-from enact_dist.core.view_desk import ViewDesk
+from enact_dist.core.protocol.messages import Fenced, Finished, Prepared
+from enact_dist.core.protocol.records import Content, Persist, Reply
+from enact_dist.core.shard.on_lock import LockDesk
+from enact_dist.core.shard.on_prepare import PrepareDesk
+from enact_dist.core.shard.on_session import SessionDesk
+from enact_dist.core.shard.on_view import ViewDesk
+from enact_dist.core.state.clock import Stamps
+from enact_dist.core.state.commits import Commits
+from enact_dist.core.state.decisions import Decisions
+from enact_dist.core.state.grants import Tenure, Tenures
+from enact_dist.core.state.history import History
+from enact_dist.core.state.sessions import Session, SessionTable
+from enact_dist.core.state.slots import SlotMap
 from enact_dist.terms import NullReason
 
 

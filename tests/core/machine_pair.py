@@ -15,9 +15,9 @@ from reference_commits import ReferenceShard
 from reference_parts import DURABILITY, RETENTION
 from shard_bench import ShardBench
 
-from enact_dist.core.datum import Slot, Token
-from enact_dist.core.ledger import Ledger
-from enact_dist.core.messages import (
+from enact_dist.core.offline.ledger import Ledger
+from enact_dist.core.protocol.datum import Slot, Token
+from enact_dist.core.protocol.messages import (
     AspectEntry,
     AwaitStamp,
     Commit,
@@ -27,11 +27,11 @@ from enact_dist.core.messages import (
     Viewed,
     Waiting,
 )
-from enact_dist.core.records import Call, Persist, Persisted, Publish, Recovered, Reply
+from enact_dist.core.protocol.records import Call, Persist, Persisted, Publish, Recovered, Reply
 
 if TYPE_CHECKING:
-    from enact_dist.core.datum import LockId
-    from enact_dist.core.messages import SlotState
+    from enact_dist.core.protocol.datum import LockId
+    from enact_dist.core.protocol.messages import SlotState
 
 ENTITIES = ("a", "tray/1", "tray/2")
 ASPECTS = ("count", "note", "frame")

@@ -17,9 +17,9 @@ from machine_messages import HOLDS, MS, TTLS, Pick, Plans
 from machine_pair import Pair
 from machine_staging import Staging
 
-from enact_dist.core.datum import LockId
-from enact_dist.core.messages import AwaitStamp, Finish, ListLocks, Survey
-from enact_dist.core.records import Called, Drain, SessionSeen, Tick
+from enact_dist.core.protocol.datum import LockId
+from enact_dist.core.protocol.messages import AwaitStamp, Finish, ListLocks, Survey
+from enact_dist.core.protocol.records import Called, Drain, SessionSeen, Tick
 
 STATES = (
     "unseen",

@@ -13,8 +13,8 @@ from machine_messages import MS, Pick
 from machine_pair import SLOTS
 from reference_table import conflict, lines_of
 
-from enact_dist.core.datum import LockId
-from enact_dist.core.messages import Item
+from enact_dist.core.protocol.datum import LockId
+from enact_dist.core.protocol.messages import Item
 from enact_dist.terms import Access
 
 LONG_NS = 60_000 * MS

@@ -13,10 +13,10 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 from machine_coverage import Coverage
 from reference_table import ReferenceTable, lines_of
 
-from enact_dist.core.datum import LockId, Slot
-from enact_dist.core.lock_table import LockTable, Mode
-from enact_dist.core.messages import Item
-from enact_dist.core.tenures import wants_of
+from enact_dist.core.protocol.datum import LockId, Slot
+from enact_dist.core.protocol.messages import Item
+from enact_dist.core.state.grants import wants_of
+from enact_dist.core.state.lock_table import LockTable, Mode
 from enact_dist.terms import Access
 
 ENTITIES = ("a", "tray/1", "tray/2")

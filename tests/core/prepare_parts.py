@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from shard_bench import S, ShardBench, datum, item, lock_id, slot
 
-from enact_dist.core.datum import Position, Token
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.datum import Position, Token
+from enact_dist.core.protocol.messages import (
     Commit,
     Committed,
     Granted,
@@ -15,7 +15,7 @@ from enact_dist.core.messages import (
     Resolved,
     WriteItem,
 )
-from enact_dist.core.records import (
+from enact_dist.core.protocol.records import (
     Called,
 )
 from enact_dist.terms import Access

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 from reference_parts import DURABILITY, RETENTION, Decision, Lane, Life
 from reference_shard import EACH, MS, ReferenceSessions
 
-from enact_dist.core.messages import Finish, Resolve
+from enact_dist.core.protocol.messages import Finish, Resolve
 from enact_dist.patterns import pattern_matches
 
 if TYPE_CHECKING:
-    from enact_dist.core.datum import LockId
+    from enact_dist.core.protocol.datum import LockId
 
 ASK_NS_MAX = 1_000 * MS
 TELL_NS_MAX = 2_000 * MS

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from reference_table import lines_of
 
 if TYPE_CHECKING:
-    from enact_dist.core.datum import LockId, Position, Slot, Token
-    from enact_dist.core.messages import Acquire, Item
+    from enact_dist.core.protocol.datum import LockId, Position, Slot, Token
+    from enact_dist.core.protocol.messages import Acquire, Item
 
 DURABILITY = {"count": "durable", "note": "os", "frame": "volatile"}
 """What a commit of each aspect survives."""

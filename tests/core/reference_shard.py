@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING
 from reference_parts import RETENTION, Decision, Expected, Lane, Life, Person, captured_of
 from reference_table import ReferenceTable
 
-from enact_dist.core.datum import Slot
-from enact_dist.core.records import Persisted
+from enact_dist.core.protocol.datum import Slot
+from enact_dist.core.protocol.records import Persisted
 from enact_dist.patterns import pattern_matches
 from enact_dist.terms import Access
 
 if TYPE_CHECKING:
-    from enact_dist.core.datum import LockId
+    from enact_dist.core.protocol.datum import LockId
 
 EACH = (Access.READ_EACH, Access.WRITE_EACH, Access.VIEW_EACH)
 GRACE_PER_CENT = 102
@@ -395,7 +395,7 @@ class ReferenceSessions:
         for life in list(self.lives.values()):
             if life.phase == "granted" and life.hold_end_ns <= self.now_ns:
                 self.end(life, "taken")
-        for session, person in list(self.people.items()):
+        for session, person in sorted(self.people.items(), key=self._silent_for_longest):
             away_ns = self.now_ns - person.lease_end_ns(self.now_ns)
             if not self.in_grace and away_ns > IDLE_TTLS * person.ttl_ns:
                 self.leave(session)
@@ -407,6 +407,10 @@ class ReferenceSessions:
         facts = self.forgotten_facts()
         if facts:
             self.persist("os", facts)
+
+    def _silent_for_longest(self, entry):
+        session, person = entry
+        return person.lease_end_ns(self.now_ns) + IDLE_TTLS * person.ttl_ns, session
 
     def ask_and_tell(self) -> None:
         """Ask primaries, tell participants."""

@@ -3,7 +3,7 @@
 A request is a set of lines.  Two lines conflict when they are about one aspect of one context, at
 least one writes, and they name one entity or either names a pattern (a pattern stands for every
 entity, those yet to come included).  A request is granted when it conflicts with no holder and
-with no earlier request that waits still.  Nothing here is taken from `enact_dist.core.lock_table`.
+with no earlier request that waits still.  Nothing here is taken from `enact_dist.core.state.lock_table`.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from enact_dist.terms import Access
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from enact_dist.core.datum import LockId, Slot
-    from enact_dist.core.messages import Item
+    from enact_dist.core.protocol.datum import LockId, Slot
+    from enact_dist.core.protocol.messages import Item
 
 
 class Line(NamedTuple):

@@ -10,8 +10,9 @@ from client_bench import ANSWER, NOTHING, REQUEST
 from repeating_cell import RepeatingCell, RepeatingClient
 from shard_bench import MS, TTL_NS, WALL_NS, S, datum, lock_id
 
-from enact_dist.core.datum import Datum, Position, Slot, Token
-from enact_dist.core.messages import (
+from enact_dist.core.client.plan import Phase
+from enact_dist.core.protocol.datum import Datum, Position, Slot, Token
+from enact_dist.core.protocol.messages import (
     Acquire,
     AspectEntry,
     AwaitStamp,
@@ -43,7 +44,6 @@ from enact_dist.core.messages import (
     Validate,
     WriteItem,
 )
-from enact_dist.core.phase import Phase
 from enact_dist.terms import Access
 
 R, W, V, WE = Access.READ, Access.WRITE, Access.VIEW, Access.WRITE_EACH

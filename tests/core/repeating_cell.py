@@ -13,16 +13,16 @@ from typing import TYPE_CHECKING, NamedTuple
 from client_bench import ANSWER, REQUEST, CellBench, ClientBench
 from shard_bench import ASPECTS, MS, Answer, Register
 
-from enact_dist.core.messages import Goodbye, Item
-from enact_dist.core.records import Called, Tick
+from enact_dist.core.protocol.messages import Goodbye, Item
+from enact_dist.core.protocol.records import Called, Tick
 from enact_dist.terms import Access
 from enact_dist.wire.frames import decode_frame, encode_frame
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from enact_dist.core.messages import Message, Request
-    from enact_dist.core.multilock import MultiLock
+    from enact_dist.core.client.lock import MultiLock
+    from enact_dist.core.protocol.messages import Message, Request
 
 
 class When(enum.Enum):

@@ -10,9 +10,9 @@ from dataclasses import replace
 from itertools import count
 from typing import TYPE_CHECKING
 
-from enact_dist.core.datum import Datum, LockId, Slot, Token
-from enact_dist.core.ledger import Ledger
-from enact_dist.core.messages import (
+from enact_dist.core.offline.ledger import Ledger
+from enact_dist.core.protocol.datum import Datum, LockId, Slot, Token
+from enact_dist.core.protocol.messages import (
     START,
     Acquire,
     Answer,
@@ -32,7 +32,7 @@ from enact_dist.core.messages import (
     SlotVersion,
     WriteItem,
 )
-from enact_dist.core.records import (
+from enact_dist.core.protocol.records import (
     Call,
     Persist,
     Persisted,
@@ -43,14 +43,14 @@ from enact_dist.core.records import (
     Story,
     Tick,
 )
-from enact_dist.core.shard import Shard
-from enact_dist.core.shard_state import ShardSettings
+from enact_dist.core.shard.shard import Shard
+from enact_dist.core.shard.state import ShardSettings
 from enact_dist.terms import Access
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from enact_dist.core.records import Event
+    from enact_dist.core.protocol.records import Event
 
 MS = 1_000_000
 S = 1_000 * MS

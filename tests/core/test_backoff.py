@@ -2,7 +2,7 @@
 
 import pytest
 
-from enact_dist.core.backoff import (
+from enact_dist.core.client.backoff import (
     AWAY_NS_MAX,
     AWAY_NS_MIN,
     IDLE_PARTS,

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from shard_bench import MS, S, ShardBench, item, lock_id, slot
 
-from enact_dist.core.datum import Datum
-from enact_dist.core.inspection import REPORT_BYTES_MAX
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.datum import Datum
+from enact_dist.core.protocol.messages import (
     OUTCOME_COMMITTED,
     AwaitStamp,
     Commit,
@@ -17,6 +16,7 @@ from enact_dist.core.messages import (
     Slice,
     WriteItem,
 )
+from enact_dist.core.shard.inspection import REPORT_BYTES_MAX
 from enact_dist.terms import Access
 
 W, WE, VE = Access.WRITE, Access.WRITE_EACH, Access.VIEW_EACH

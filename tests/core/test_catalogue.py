@@ -5,10 +5,8 @@ from random import Random
 import pytest
 from shard_bench import ShardBench, item, lock_id, slot
 
-from enact_dist.core import catalogue, inspection
-from enact_dist.core.catalogue import ASPECTS_MAX, CATALOGUE_BYTES_MAX, WORLDS_MAX
-from enact_dist.core.forgetting import planned, unused_aspects, unused_worlds, world_drops
-from enact_dist.core.messages import (
+from enact_dist.core.offline.forgetting import planned, unused_aspects, unused_worlds, world_drops
+from enact_dist.core.protocol.messages import (
     AspectEntry,
     DropWorld,
     EpochChanged,
@@ -21,12 +19,15 @@ from enact_dist.core.messages import (
     Welcome,
     WorldEntry,
 )
-from enact_dist.core.records import (
+from enact_dist.core.protocol.records import (
     Recovered,
     SlotRecord,
     WorldDropped,
     WorldRecord,
 )
+from enact_dist.core.shard import inspection
+from enact_dist.core.state import catalogue
+from enact_dist.core.state.catalogue import ASPECTS_MAX, CATALOGUE_BYTES_MAX, WORLDS_MAX
 from enact_dist.terms import Access
 from enact_dist.wire.frames import encode_frame
 

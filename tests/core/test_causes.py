@@ -6,10 +6,9 @@ import pytest
 from client_bench import CellBench
 from shard_bench import MS, S, ShardBench, datum, item, lock_id, pages_of, slot
 
-from enact_dist.core import pages
-from enact_dist.core.causes import READ_BYTES
-from enact_dist.core.message_parts import READS_MAX
-from enact_dist.core.messages import (
+from enact_dist.core.client.plan import Phase
+from enact_dist.core.protocol import pages
+from enact_dist.core.protocol.messages import (
     AspectEntry,
     Cause,
     Commit,
@@ -23,9 +22,10 @@ from enact_dist.core.messages import (
     SlotVersion,
     WriteItem,
 )
-from enact_dist.core.pages import PAGE_BYTES_MAX
-from enact_dist.core.phase import Phase
-from enact_dist.core.version_list import bytes_of
+from enact_dist.core.protocol.pages import PAGE_BYTES_MAX
+from enact_dist.core.protocol.parts import READS_MAX
+from enact_dist.core.shard.on_history import bytes_of
+from enact_dist.core.state.causes import READ_BYTES
 from enact_dist.terms import Access
 from enact_dist.wire.frames import encode_frame
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from shard_bench import S, datum, item, lock_id, slot
 
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.messages import (
     OUTCOME_COMMITTED,
     OUTCOME_EXPIRED,
     Changed,
@@ -18,7 +18,7 @@ from enact_dist.core.messages import (
     Refused,
     WriteItem,
 )
-from enact_dist.core.records import OutcomeRecord, SlotRecord
+from enact_dist.core.protocol.records import OutcomeRecord, SlotRecord
 from enact_dist.terms import Access, Durability
 
 R, W, V, WE = Access.READ, Access.WRITE, Access.VIEW, Access.WRITE_EACH

@@ -6,8 +6,8 @@ import pytest
 from prepare_parts import ANN, FAR_TOKEN, STAMP_NS, R, W, called, prepare_of, prepared
 from shard_bench import MS, TTL_NS, S, ShardBench, item, lock_id, slot
 
-from enact_dist.core.datum import Position
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.datum import Position
+from enact_dist.core.protocol.messages import (
     RESOLVED_ABORTED,
     RESOLVED_COMMITTED,
     RESOLVED_OPEN,
@@ -28,7 +28,7 @@ from enact_dist.core.messages import (
     SlotVersion,
     Waiting,
 )
-from enact_dist.core.records import (
+from enact_dist.core.protocol.records import (
     AuditRecord,
     PreparedEnded,
     PreparedRecord,

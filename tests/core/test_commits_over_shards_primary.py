@@ -8,9 +8,8 @@ import pytest
 from prepare_parts import ANN, FAR_TOKEN, STAMP_NS, V, W, decided, prepared
 from shard_bench import MS, TTL_NS, S, ShardBench, datum, item, lock_id, slot
 
-from enact_dist.core.datum import Position, Token
-from enact_dist.core.decisions import AGAIN_NS_MIN
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.datum import Position, Token
+from enact_dist.core.protocol.messages import (
     RESOLVED_ABORTED,
     RESOLVED_COMMITTED,
     RESOLVED_OPEN,
@@ -33,7 +32,7 @@ from enact_dist.core.messages import (
     Viewed,
     WriteItem,
 )
-from enact_dist.core.records import (
+from enact_dist.core.protocol.records import (
     Called,
     DecisionDone,
     DecisionRecord,
@@ -41,6 +40,7 @@ from enact_dist.core.records import (
     ShardReturned,
     Tick,
 )
+from enact_dist.core.state.decisions import AGAIN_NS_MIN
 
 
 @pytest.fixture

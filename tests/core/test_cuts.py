@@ -6,8 +6,11 @@ import pytest
 from client_bench import ANSWER, NOTHING, CellBench, ClientBench
 from shard_bench import MS, TTL_NS, S, datum, item, lock_id, slot
 
-from enact_dist.core.cuts import ROUNDS_MAX, Cut
-from enact_dist.core.messages import (
+from enact_dist.core.client.cut import ROUNDS_MAX, Cut
+from enact_dist.core.client.lock import MultiLock
+from enact_dist.core.client.own_commits import SLOTS_MAX
+from enact_dist.core.client.plan import Phase
+from enact_dist.core.protocol.messages import (
     Commit,
     Finish,
     Outcome,
@@ -17,11 +20,8 @@ from enact_dist.core.messages import (
     Viewed,
     WriteItem,
 )
-from enact_dist.core.multilock import MultiLock
-from enact_dist.core.phase import Phase
-from enact_dist.core.placement import shard_of
-from enact_dist.core.records import Called
-from enact_dist.core.unsettled import SLOTS_MAX
+from enact_dist.core.protocol.placement import shard_of
+from enact_dist.core.protocol.records import Called
 from enact_dist.terms import Access
 
 R, W, V = Access.READ, Access.WRITE, Access.VIEW

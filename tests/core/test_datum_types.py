@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shard_bench import item, lock_id
 
-from enact_dist.core.catalogue import Catalogue
-from enact_dist.core.datum_types import (
+from enact_dist.core.offline.moving import Shards
+from enact_dist.core.protocol.datum_types import (
     TYPES_MAX,
     newest,
     same_type,
@@ -16,7 +16,7 @@ from enact_dist.core.datum_types import (
     type_conflict,
     with_type_of,
 )
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.messages import (
     AspectEntry,
     Granted,
     PlacementMap,
@@ -26,8 +26,8 @@ from enact_dist.core.messages import (
     Release,
     ShardEntry,
 )
-from enact_dist.core.moving import Shards
-from enact_dist.core.records import Recovered
+from enact_dist.core.protocol.records import Recovered
+from enact_dist.core.state.catalogue import Catalogue
 from enact_dist.terms import Access
 
 R, W = Access.READ, Access.WRITE

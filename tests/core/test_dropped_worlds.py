@@ -6,8 +6,8 @@ import pytest
 from shard_bench import ShardBench, item, lock_id, slot
 from world_parts import V, W, content, drop, fork, of, write
 
-from enact_dist.core.datum import Position, Token
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.datum import Position, Token
+from enact_dist.core.protocol.messages import (
     Dropped,
     DropWorld,
     EpochChanged,
@@ -26,8 +26,8 @@ from enact_dist.core.messages import (
     TakeView,
     WriteItem,
 )
-from enact_dist.core.records import KeptRecord, WorldDropped
-from enact_dist.core.worlds import CHANGES_MAX
+from enact_dist.core.protocol.records import KeptRecord, WorldDropped
+from enact_dist.core.shard.on_world import CHANGES_MAX
 
 
 @pytest.fixture

@@ -11,8 +11,7 @@ from math import inf
 from failure_parts import ANN, BOB, READ, WRITE, seeded
 from shard_bench import MS, TTL_NS, S, lock_id, slot
 
-from enact_dist.core.latencies import BOUNDS_S
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.messages import (
     Alive,
     Committed,
     EpochChanged,
@@ -24,7 +23,8 @@ from enact_dist.core.messages import (
     Waiting,
     Welcome,
 )
-from enact_dist.core.records import SessionSeen, Tick
+from enact_dist.core.protocol.records import SessionSeen, Tick
+from enact_dist.core.state.clock import BOUNDS_S
 
 
 class TestHello:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from failure_parts import ANN, BOB, READ, WRITE, seeded
 from shard_bench import MS, TTL_NS, S, lock_id, slot
 
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.messages import (
     OUTCOME_COMMITTED,
     OUTCOME_PENDING,
     OUTCOME_UNSEEN,

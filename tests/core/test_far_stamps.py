@@ -6,9 +6,9 @@ import pytest
 from prepare_parts import ANN, FAR_TOKEN, W, prepare_of, prepared
 from shard_bench import TTL_NS, S, ShardBench, item, lock_id, slot
 
-from enact_dist.core.client import Client
-from enact_dist.core.datum import Position
-from enact_dist.core.messages import (
+from enact_dist.core.client.client import Client
+from enact_dist.core.protocol.datum import Position
+from enact_dist.core.protocol.messages import (
     RESOLVED_COMMITTED,
     Commit,
     Committed,
@@ -21,8 +21,8 @@ from enact_dist.core.messages import (
     Resolved,
     TakeView,
 )
-from enact_dist.core.records import Called
-from enact_dist.core.stamps import STAMP_NS_MAX
+from enact_dist.core.protocol.records import Called
+from enact_dist.core.state.clock import STAMP_NS_MAX
 from enact_dist.terms import Access
 
 BIG = (1 << 63) - 1

@@ -4,10 +4,17 @@ from __future__ import annotations
 
 from shard_bench import datum, lock_id, slot
 
-from enact_dist.core.datum import Token
-from enact_dist.core.finishing import Finishing, tokens_of
-from enact_dist.core.lock_parts import Part
-from enact_dist.core.messages import Commit, Prepare, Prepared, SlotVersion, Validate, WriteItem
+from enact_dist.core.client.finishing import Finishing, tokens_of
+from enact_dist.core.client.plan import Part
+from enact_dist.core.protocol.datum import Token
+from enact_dist.core.protocol.messages import (
+    Commit,
+    Prepare,
+    Prepared,
+    SlotVersion,
+    Validate,
+    WriteItem,
+)
 
 LOCK = lock_id("ann")
 TOKENS = {"a": Token(1, 5), "b": Token(2, 6), "c": Token(3, 7), "d": Token(4, 0)}

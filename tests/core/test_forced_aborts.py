@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from shard_bench import S, ShardBench, datum, item, lock_id, slot
 
-from enact_dist.core.datum import Position, Token
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.datum import Position, Token
+from enact_dist.core.protocol.messages import (
     RESOLVED_ABORTED,
     RESOLVED_COMMITTED,
     RESOLVED_OPEN,
@@ -25,7 +25,7 @@ from enact_dist.core.messages import (
     Resolved,
     WriteItem,
 )
-from enact_dist.core.records import Called, ShardReturned
+from enact_dist.core.protocol.records import Called, ShardReturned
 from enact_dist.terms import Access
 
 ANN, BOB = lock_id("ann"), lock_id("bob")

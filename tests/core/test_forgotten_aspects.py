@@ -6,8 +6,8 @@ import pytest
 from shard_bench import ASPECTS, WALL_NS, S, ShardBench, item, lock_id, slot
 from world_parts import LOCKS, V, content, fork, of, write
 
-from enact_dist.core.messages import Forgotten, Forked, Register, TakeView, Viewed
-from enact_dist.core.records import AspectForgotten, BasesMoved
+from enact_dist.core.protocol.messages import Forgotten, Forked, Register, TakeView, Viewed
+from enact_dist.core.protocol.records import AspectForgotten, BasesMoved
 from enact_dist.terms import Access
 
 AT_NS = WALL_NS + 100 * S

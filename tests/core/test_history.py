@@ -8,9 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shard_bench import S, ShardBench, datum, item, lock_id, slot
 
-from enact_dist.core.datum import Datum
-from enact_dist.core.history import Policy
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.datum import Datum
+from enact_dist.core.protocol.messages import (
     Forgotten,
     KeepVersions,
     ListHistory,
@@ -21,8 +20,10 @@ from enact_dist.core.messages import (
     Viewed,
     WriteItem,
 )
-from enact_dist.core.retaining import NO_LIMIT, Limits
-from enact_dist.core.slots import Content, SlotMap
+from enact_dist.core.protocol.records import Content
+from enact_dist.core.state.history import Policy
+from enact_dist.core.state.retention import NO_LIMIT, Limits
+from enact_dist.core.state.slots import SlotMap
 from enact_dist.terms import NullReason
 
 

@@ -16,7 +16,7 @@ from machine_coverage import settings_of
 from machine_history import ShardHistoryMachine
 from time_runs import run_and_meet
 
-from enact_dist.core.shard import Shard
+from enact_dist.core.shard.shard import Shard
 
 EXAMPLES, STEPS = 40, 80
 EXAMPLES_OF_A_MUTANT = 3000

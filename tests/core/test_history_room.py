@@ -3,11 +3,11 @@
 import pytest
 from shard_bench import slot
 
-from enact_dist.core.datum import Datum
-from enact_dist.core.history import HELD_BYTES_MAX, Policy
-from enact_dist.core.records import SlotRecord
-from enact_dist.core.retaining import NO_LIMIT, Limits
-from enact_dist.core.slots import Content, SlotMap
+from enact_dist.core.protocol.datum import Datum
+from enact_dist.core.protocol.records import Content, SlotRecord
+from enact_dist.core.state.history import HELD_BYTES_MAX, Policy
+from enact_dist.core.state.retention import NO_LIMIT, Limits
+from enact_dist.core.state.slots import SlotMap
 from enact_dist.terms import NullReason
 
 MB = 1_000_000

@@ -5,9 +5,9 @@ from __future__ import annotations
 from client_bench import CellBench
 from shard_bench import S, item, slot
 
-from enact_dist.core.datum import Datum
-from enact_dist.core.messages import Refused, WriteItem
-from enact_dist.core.phase import Phase
+from enact_dist.core.client.plan import Phase
+from enact_dist.core.protocol.datum import Datum
+from enact_dist.core.protocol.messages import Refused, WriteItem
 from enact_dist.terms import Access
 
 MISSING = Refused("no_payload", "send the bytes")

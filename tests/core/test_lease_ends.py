@@ -8,10 +8,10 @@ import pytest
 from prepare_parts import FAR_TOKEN
 from shard_bench import MS, S, ShardBench, item, lock_id, slot
 
-from enact_dist.core.due_times import STALE_MAX, DueTimes
-from enact_dist.core.messages import Commit, Goodbye, Granted, Prepare, Release, WriteItem
-from enact_dist.core.records import SessionSeen, Tick
-from enact_dist.core.sessions import IDLE_TTLS, Session
+from enact_dist.core.protocol.messages import Commit, Goodbye, Granted, Prepare, Release, WriteItem
+from enact_dist.core.protocol.records import SessionSeen, Tick
+from enact_dist.core.state.due_times import STALE_MAX, DueTimes
+from enact_dist.core.state.sessions import IDLE_TTLS, Session
 from enact_dist.terms import Access
 
 NAMES = ("ann", "bob", "cec", "dan", "eva")

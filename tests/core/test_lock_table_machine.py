@@ -9,8 +9,9 @@ from hypothesis.stateful import run_state_machine_as_test
 from machine_coverage import Coverage, examples, run_and_cover, settings_of
 from machine_table import ACTS, CLAIMS, NEWCOMERS, THERE, UNREACHABLE, TableMachine
 
-from enact_dist.core import lock_table, tenures
-from enact_dist.core.lock_table import CONFLICTS, Mode
+from enact_dist.core.state import grants as tenures
+from enact_dist.core.state import lock_table
+from enact_dist.core.state.lock_table import CONFLICTS, Mode
 
 EXAMPLES = 150
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from shard_bench import ShardBench, datum, item, lock_id, slot
 
-from enact_dist.core.datum import Token
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.datum import Token
+from enact_dist.core.protocol.messages import (
     Commit,
     Committed,
     Fenced,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from shard_bench import ShardBench, datum, item, lock_id, slot
 
-from enact_dist.core.datum import Position, Token
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.datum import Position, Token
+from enact_dist.core.protocol.messages import (
     AspectEntry,
     Commit,
     Committed,

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import pytest
 from shard_bench import ASPECTS, MS, TTL_NS, WALL_NS, S, datum, item, slot
 
-from enact_dist.core import history, sessions, tenures
-from enact_dist.core.client import Client
-from enact_dist.core.messages import (
+from enact_dist.core.client.client import Client
+from enact_dist.core.client.plan import Phase
+from enact_dist.core.protocol.messages import (
     Commit,
     Goodbye,
     Hello,
@@ -22,17 +22,26 @@ from enact_dist.core.messages import (
     ShardEntry,
     WriteItem,
 )
-from enact_dist.core.phase import Phase
-from enact_dist.core.placement import shard_of
-from enact_dist.core.records import Call, Called, Persist, Persisted, Recovered, Reply, Tick
-from enact_dist.core.shard import Shard
-from enact_dist.core.shard_state import ShardSettings
+from enact_dist.core.protocol.placement import shard_of
+from enact_dist.core.protocol.records import (
+    Call,
+    Called,
+    Persist,
+    Persisted,
+    Recovered,
+    Reply,
+    Tick,
+)
+from enact_dist.core.shard.shard import Shard
+from enact_dist.core.shard.state import ShardSettings
+from enact_dist.core.state import grants as tenures
+from enact_dist.core.state import history, sessions
 from enact_dist.terms import Access
 
 if TYPE_CHECKING:
-    from enact_dist.core.messages import Answer, Request
-    from enact_dist.core.multilock import MultiLock
-    from enact_dist.core.records import Effect
+    from enact_dist.core.client.lock import MultiLock
+    from enact_dist.core.protocol.messages import Answer, Request
+    from enact_dist.core.protocol.records import Effect
 
 PLACEMENT = PlacementMap(1, (ShardEntry("a", ()), ShardEntry("b", ())), ())
 CODE = (type, FunctionType, MethodType, BuiltinFunctionType, ModuleType)

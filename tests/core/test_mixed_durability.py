@@ -5,9 +5,17 @@ from __future__ import annotations
 import pytest
 from shard_bench import S, ShardBench, datum, item, lock_id, slot
 
-from enact_dist.core.datum import Position, Token
-from enact_dist.core.messages import Commit, Finish, Finished, Granted, Prepare, TakeView, WriteItem
-from enact_dist.core.records import DecisionRecord, PreparedEnded, PreparedRecord
+from enact_dist.core.protocol.datum import Position, Token
+from enact_dist.core.protocol.messages import (
+    Commit,
+    Finish,
+    Finished,
+    Granted,
+    Prepare,
+    TakeView,
+    WriteItem,
+)
+from enact_dist.core.protocol.records import DecisionRecord, PreparedEnded, PreparedRecord
 from enact_dist.terms import Access, Durability
 
 ANN = lock_id("ann")

@@ -6,15 +6,15 @@ import pytest
 from client_bench import CellBench
 from shard_bench import MS, TTL_NS, item, slot
 
-from enact_dist.core.datum import Slot
-from enact_dist.core.messages import (
+from enact_dist.core.client.plan import Phase
+from enact_dist.core.protocol.datum import Slot
+from enact_dist.core.protocol.messages import (
     Outcome,
     OutcomeIs,
     Release,
     Validate,
     Waiting,
 )
-from enact_dist.core.phase import Phase
 from enact_dist.terms import Access
 
 R, W, V, WE = Access.READ, Access.WRITE, Access.VIEW, Access.WRITE_EACH

@@ -6,14 +6,14 @@ import pytest
 from client_bench import ANSWER, NOTHING, REQUEST, CellBench, ClientBench
 from shard_bench import MS, TTL_NS, S, item, slot
 
-from enact_dist.core.messages import (
+from enact_dist.core.client.plan import Phase
+from enact_dist.core.protocol.messages import (
     Acquire,
     Commit,
     Granted,
     Outcome,
     Refused,
 )
-from enact_dist.core.phase import Phase
 from enact_dist.terms import Access
 
 R, W, V, WE = Access.READ, Access.WRITE, Access.VIEW, Access.WRITE_EACH

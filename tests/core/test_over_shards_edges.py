@@ -8,10 +8,17 @@ import pytest
 from client_bench import CellBench
 from shard_bench import ShardBench, datum, item, lock_id, slot
 
-from enact_dist.core.datum import Position, Token
-from enact_dist.core.messages import Commit, Finish, Finished, PlacementMap, Prepare, WriteItem
-from enact_dist.core.phase import Phase
-from enact_dist.core.records import Called, DecisionDone, Drain
+from enact_dist.core.client.plan import Phase
+from enact_dist.core.protocol.datum import Position, Token
+from enact_dist.core.protocol.messages import (
+    Commit,
+    Finish,
+    Finished,
+    PlacementMap,
+    Prepare,
+    WriteItem,
+)
+from enact_dist.core.protocol.records import Called, DecisionDone, Drain
 from enact_dist.terms import Access
 
 W, V = Access.WRITE, Access.VIEW

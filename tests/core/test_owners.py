@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from shard_bench import S, ShardBench, datum, item, lock_id, slot
 
-from enact_dist.core import messages as m
-from enact_dist.core.datum import Position, Token
-from enact_dist.core.messages import (
+from enact_dist.core.protocol import messages as m
+from enact_dist.core.protocol.datum import Position, Token
+from enact_dist.core.protocol.messages import (
     AuditEntry,
     Committed,
     EpochChanged,
@@ -23,7 +23,7 @@ from enact_dist.core.messages import (
     Welcome,
     WriteItem,
 )
-from enact_dist.core.records import SessionDied, SessionRecord, SessionSeen
+from enact_dist.core.protocol.records import SessionDied, SessionRecord, SessionSeen
 from enact_dist.terms import Access
 
 ANN, EVE = "ann@h:1", "eve@h:2"

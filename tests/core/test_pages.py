@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from shard_bench import ShardBench, item, lock_id, pages_of, slot
 
-from enact_dist.core import inspection, pages, version_list
-from enact_dist.core.client import Client
-from enact_dist.core.messages import (
+from enact_dist.core.client.client import Client
+from enact_dist.core.protocol import pages
+from enact_dist.core.protocol.messages import (
     START,
     AspectEntry,
     Cursor,
@@ -27,7 +27,8 @@ from enact_dist.core.messages import (
     Surveyed,
     Welcome,
 )
-from enact_dist.core.records import AuditRecord
+from enact_dist.core.protocol.records import AuditRecord
+from enact_dist.core.shard import inspection, on_history
 from enact_dist.terms import Access
 from enact_dist.wire.frames import encode_frame
 
@@ -160,9 +161,9 @@ def test_slot_with_many_versions_is_not_listed_anew_for_each_page(monkeypatch):
     for seq in range(1, 301):
         bench.write("ann", seq, str(seq), to=slot(aspect="many"))
     made = []
-    real = version_list.state_of
-    monkeypatch.setattr(version_list, "state_of", lambda *a, **k: made.append(1) or real(*a, **k))
-    monkeypatch.setattr(inspection, "state_of", version_list.state_of)
+    real = on_history.state_of
+    monkeypatch.setattr(on_history, "state_of", lambda *a, **k: made.append(1) or real(*a, **k))
+    monkeypatch.setattr(inspection, "state_of", on_history.state_of)
     monkeypatch.setattr(pages, "WORK_MAX", 50)
 
     for first, field in (

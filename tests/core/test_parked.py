@@ -9,8 +9,8 @@ import pytest
 from prepare_parts import FAR_TOKEN, W, prepare_of, prepared
 from shard_bench import MS, S, ShardBench, item, lock_id, slot
 
-from enact_dist.core.datum import Position
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.datum import Position
+from enact_dist.core.protocol.messages import (
     Answer,
     AwaitStamp,
     EpochChanged,
@@ -25,8 +25,8 @@ from enact_dist.core.messages import (
     Viewed,
     Waiting,
 )
-from enact_dist.core.parked import OF_A_SESSION_MAX
-from enact_dist.core.records import Drain, Tick
+from enact_dist.core.protocol.records import Drain, Tick
+from enact_dist.core.shard.parked import OF_A_SESSION_MAX
 from enact_dist.terms import Access
 
 ANN = lock_id("ann")
@@ -173,7 +173,7 @@ def test_view_waits_for_one_undecided_commit_after_the_other(bench):
 
 def test_view_that_is_one_too_many_is_answered_early(bench, monkeypatch):
     """Its interval says that it ends before the commit; it may be asked again."""
-    monkeypatch.setattr("enact_dist.core.view_desk.WAITING_MAX", 2)
+    monkeypatch.setattr("enact_dist.core.shard.on_view.WAITING_MAX", 2)
     prepared(bench)
     at_ns = bench.wall_ns + S // 2
     asked = [
@@ -204,7 +204,7 @@ def waiting(bench: ShardBench, session: str, number: int, *items: Item) -> Answe
 
 def test_requests_of_one_identity_that_wait_are_bounded(bench, monkeypatch):
     """A few locks of thousands of requests each are as bad as thousands of locks."""
-    monkeypatch.setattr("enact_dist.core.quotas.ITEMS_WAITING_MAX", 5)
+    monkeypatch.setattr("enact_dist.core.shard.quotas.ITEMS_WAITING_MAX", 5)
     for session in ("dora", "dan"):
         bench.ask_as("d", Hello(session, 0, 2 * S, session, "host", 1, False))
     holder = bench.granted(lock_id("ann", 9), item(W))
@@ -223,7 +223,7 @@ def test_requests_of_one_identity_that_wait_are_bounded(bench, monkeypatch):
 
 def test_many_patterns_over_many_slots_are_refused(bench, monkeypatch):
     """Each is matched with every slot while everybody waits; one pattern alone is always looked at."""
-    monkeypatch.setattr("enact_dist.core.lock_desk.LOOKED_MAX", 5)
+    monkeypatch.setattr("enact_dist.core.shard.on_lock.LOOKED_MAX", 5)
     for number in range(6):
         bench.write("bob", number + 1, "1", to=slot(f"e{number}"))
     one = item(Access.VIEW_EACH, "*")

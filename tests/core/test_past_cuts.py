@@ -6,11 +6,11 @@ import pytest
 from client_bench import NOTHING, REQUEST, CellBench, ClientBench
 from shard_bench import MS, S, item, lock_id, slot
 
-from enact_dist.core.cuts import Cut
-from enact_dist.core.messages import Finish, Forgotten, TakeView, Viewed
-from enact_dist.core.multilock import MultiLock
-from enact_dist.core.phase import Phase
-from enact_dist.core.records import Called
+from enact_dist.core.client.cut import Cut
+from enact_dist.core.client.lock import MultiLock
+from enact_dist.core.client.plan import Phase
+from enact_dist.core.protocol.messages import Finish, Forgotten, TakeView, Viewed
+from enact_dist.core.protocol.records import Called
 from enact_dist.terms import Access
 
 W, V = Access.WRITE, Access.VIEW

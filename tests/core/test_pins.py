@@ -3,9 +3,17 @@
 import pytest
 from shard_bench import ShardBench, item, lock_id, slot
 
-from enact_dist.core.datum import Datum
-from enact_dist.core.messages import Commit, Fetch, Gone, Release, Slice, TakeView, WriteItem
-from enact_dist.core.sessions import LANES_MAX
+from enact_dist.core.protocol.datum import Datum
+from enact_dist.core.protocol.messages import (
+    Commit,
+    Fetch,
+    Gone,
+    Release,
+    Slice,
+    TakeView,
+    WriteItem,
+)
+from enact_dist.core.state.sessions import LANES_MAX
 from enact_dist.terms import Access
 
 SIZE = 300_000

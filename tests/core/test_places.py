@@ -3,10 +3,10 @@
 import pytest
 from shard_bench import ShardBench
 
-from enact_dist.core.messages import ListPlaces, PlacementMap, Places, Refused, ShardEntry
-from enact_dist.core.owners import shard_identity
-from enact_dist.core.places import PLACE_CHARACTERS_MAX, PLACES_MAX
-from enact_dist.core.records import Call, Compare, Served, ShardReturned
+from enact_dist.core.protocol.messages import ListPlaces, PlacementMap, Places, Refused, ShardEntry
+from enact_dist.core.protocol.records import Call, Compare, Served, ShardReturned
+from enact_dist.core.shard.owners import shard_identity
+from enact_dist.core.shard.places import PLACE_CHARACTERS_MAX, PLACES_MAX
 
 OURS = (ShardEntry("s0", ("zero",)), ShardEntry("far", ("one",)))
 

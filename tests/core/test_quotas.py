@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from shard_bench import MS, S, ShardBench, item, lock_id
 
-from enact_dist.core import quotas, sessions
-from enact_dist.core.messages import Goodbye, Granted, Hello, KeepAlive, Refused, Welcome
-from enact_dist.core.records import SessionSeen
+from enact_dist.core.protocol.messages import Goodbye, Granted, Hello, KeepAlive, Refused, Welcome
+from enact_dist.core.protocol.records import SessionSeen
+from enact_dist.core.shard import quotas
+from enact_dist.core.state import sessions
 from enact_dist.terms import Access
 
 GREEDY, MODEST = "greedy@h:1", "modest@h:2"
@@ -55,7 +56,7 @@ def test_recovered_sessions_count_for_their_identity():
 
 def test_full_table_makes_room_for_who_shows_a_sign_of_life(monkeypatch):
     """Sessions opened in a loop, under ever new names, keep nobody out, nor displace who works."""
-    monkeypatch.setattr("enact_dist.core.sessions.SESSIONS_MAX", 20)
+    monkeypatch.setattr("enact_dist.core.state.sessions.SESSIONS_MAX", 20)
     bench = ShardBench()
     epoch = bench.shard.epoch
     bench.ask_as("alive@h:1", hello("alive"))
@@ -78,7 +79,7 @@ def test_full_table_makes_room_for_who_shows_a_sign_of_life(monkeypatch):
 
 def test_table_full_of_living_sessions_refuses_by_name(monkeypatch):
     """Nobody who works is displaced."""
-    monkeypatch.setattr("enact_dist.core.sessions.SESSIONS_MAX", 5)
+    monkeypatch.setattr("enact_dist.core.state.sessions.SESSIONS_MAX", 5)
     bench = ShardBench()
     for number in range(5):
         bench.ask_as(f"a@h:{number}", hello(f"s{number}"))
@@ -92,7 +93,7 @@ def test_table_full_of_living_sessions_refuses_by_name(monkeypatch):
 
 def test_table_that_was_full_before_a_restart_keeps_nobody_out_after_it(monkeypatch):
     """Neither while the shard waits for those that it knew, nor when they have not come back."""
-    monkeypatch.setattr("enact_dist.core.sessions.SESSIONS_MAX", 20)
+    monkeypatch.setattr("enact_dist.core.state.sessions.SESSIONS_MAX", 20)
     bench = ShardBench()
     for number in range(20):
         bench.ask_as(f"x@h:{number}", hello(f"flood{number}", observer=False))

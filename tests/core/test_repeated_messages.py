@@ -16,11 +16,10 @@ from repeated_runs import RUNS, SHARDS
 from repeating_cell import Again, RepeatingCell, When
 from shard_bench import TTL_NS, ShardBench, datum, item, lock_id, slot
 
-from enact_dist.core import client
-from enact_dist.core.commits import Commits
-from enact_dist.core.datum import Token
-from enact_dist.core.forced import ALARM, Audit
-from enact_dist.core.messages import (
+from enact_dist.core.client import session as client
+from enact_dist.core.client.plan import Phase
+from enact_dist.core.protocol.datum import Token
+from enact_dist.core.protocol.messages import (
     Answer,
     Break,
     Broken,
@@ -45,10 +44,11 @@ from enact_dist.core.messages import (
     Validate,
     WriteItem,
 )
-from enact_dist.core.phase import Phase
-from enact_dist.core.records import AuditRecord
-from enact_dist.core.sessions import IDLE_TTLS, Lane
-from enact_dist.core.shard_state import ShardState
+from enact_dist.core.protocol.records import AuditRecord
+from enact_dist.core.shard.state import ShardState
+from enact_dist.core.state.audit import ALARM, Audit
+from enact_dist.core.state.commits import Commits
+from enact_dist.core.state.sessions import IDLE_TTLS, Lane
 from enact_dist.terms import Access
 
 TWO_SHARDS = PlacementMap(1, (ShardEntry("s0", ()), ShardEntry("s1", ())), ())

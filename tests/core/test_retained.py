@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from shard_bench import TTL_NS, ShardBench, item, lock_id, slot
 
-from enact_dist.core.client import Client
-from enact_dist.core.datum import Datum
-from enact_dist.core.messages import (
+from enact_dist.core.client.client import Client
+from enact_dist.core.protocol.datum import Datum
+from enact_dist.core.protocol.messages import (
     AspectEntry,
     Commit,
     Fetch,
@@ -28,8 +28,8 @@ from enact_dist.core.messages import (
     Viewed,
     WriteItem,
 )
-from enact_dist.core.retaining import NO_LIMIT
-from enact_dist.core.slots import INLINE_BYTES_MAX
+from enact_dist.core.state.retention import NO_LIMIT
+from enact_dist.core.state.slots import INLINE_BYTES_MAX
 from enact_dist.terms import Access, NullReason
 
 W, V = Access.WRITE, Access.VIEW

@@ -2,8 +2,8 @@
 
 import pytest
 
-from enact_dist.core.messages import AspectEntry
-from enact_dist.core.retaining import (
+from enact_dist.core.protocol.messages import AspectEntry
+from enact_dist.core.state.retention import (
     DEFAULT,
     NO_LIMIT,
     Limits,

@@ -6,9 +6,7 @@ import pytest
 from history_parts import SEC, W, as_of, keep, listed, retain, shown, write
 from shard_bench import S, ShardBench, datum, item, lock_id, slot
 
-from enact_dist.core import history
-from enact_dist.core.history import Policy
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.messages import (
     EpochChanged,
     Forgotten,
     KeepVersions,
@@ -16,9 +14,11 @@ from enact_dist.core.messages import (
     ListHistory,
     SlotVersion,
 )
-from enact_dist.core.records import HistoryForgotten, Persist
-from enact_dist.core.retaining import NO_LIMIT, Limits
-from enact_dist.core.slots import Content, SlotMap
+from enact_dist.core.protocol.records import Content, HistoryForgotten, Persist
+from enact_dist.core.state import history
+from enact_dist.core.state.history import Policy
+from enact_dist.core.state.retention import NO_LIMIT, Limits
+from enact_dist.core.state.slots import SlotMap
 from enact_dist.terms import NullReason
 
 
@@ -233,7 +233,7 @@ class TestLabels:
     def test_who_asks_wrongly_is_refused(self, bench, monkeypatch):
         """A stranger, a name that nobody can read, and more than there is room for."""
         write(bench, "1")
-        monkeypatch.setattr("enact_dist.core.history_desk.KEPT_MAX", 1)
+        monkeypatch.setattr("enact_dist.core.shard.on_history.KEPT_MAX", 1)
         version = SlotVersion(slot(), 1)
 
         stranger = bench.ask(KeepVersions("zoe", "a", (version,)))

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 from shard_bench import MS, TTL_NS, S, item, lock_id, slot
 
-from enact_dist.core.beliefs import shortened_ns
-from enact_dist.core.datum import Datum
-from enact_dist.core.messages import (
+from enact_dist.core.client.lease_clock import shortened_ns
+from enact_dist.core.protocol.datum import Datum
+from enact_dist.core.protocol.messages import (
     Alive,
     AspectEntry,
     AwaitStamp,
@@ -38,7 +38,7 @@ from enact_dist.core.messages import (
     WriteItem,
     WrongShard,
 )
-from enact_dist.core.records import (
+from enact_dist.core.protocol.records import (
     Drain,
     SessionDied,
     SessionEnded,

@@ -14,7 +14,7 @@ from hypothesis.stateful import run_state_machine_as_test
 from machine_coverage import Coverage, examples, run_and_cover, settings_of
 from machine_shard import EVENTS, STATES, UNREACHABLE, ShardMachine
 
-from enact_dist.core.shard import Shard
+from enact_dist.core.shard.shard import Shard
 
 EXAMPLES = 100
 EXAMPLES_OF_A_MUTANT = 3000

@@ -9,16 +9,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from shard_bench import S, datum, slot
 
-from enact_dist.core.beliefs import SENDINGS_KEPT, Sendings, shortened_ns
-from enact_dist.core.catalogue import Catalogue
-from enact_dist.core.datum import Column, Datum, Position, Slot
-from enact_dist.core.forced import ALARM, ENTRIES_MAX, SETTLED, Audit
-from enact_dist.core.messages import AspectEntry, Item, Pin, PlacementMap, ShardEntry
-from enact_dist.core.placement import shard_of
-from enact_dist.core.records import AuditRecord, SlotRecord
-from enact_dist.core.sessions import Session
-from enact_dist.core.slots import INLINE_BYTES_MAX, NOTHING, Content, SlotMap
-from enact_dist.core.stamps import AHEAD_NS_MAX, Stamps
+from enact_dist.core.client.lease_clock import SENDINGS_KEPT, Sendings, shortened_ns
+from enact_dist.core.protocol.datum import Column, Datum, Position, Slot
+from enact_dist.core.protocol.messages import AspectEntry, Item, Pin, PlacementMap, ShardEntry
+from enact_dist.core.protocol.placement import shard_of
+from enact_dist.core.protocol.records import NOTHING, AuditRecord, Content, SlotRecord
+from enact_dist.core.state.audit import ALARM, ENTRIES_MAX, SETTLED, Audit
+from enact_dist.core.state.catalogue import Catalogue
+from enact_dist.core.state.clock import AHEAD_NS_MAX, Stamps
+from enact_dist.core.state.sessions import Session
+from enact_dist.core.state.slots import INLINE_BYTES_MAX, SlotMap
 from enact_dist.terms import Access, NullReason
 
 STEPS = st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 10**6)), min_size=1, max_size=30)

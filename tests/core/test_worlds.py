@@ -6,9 +6,8 @@ import pytest
 from shard_bench import ASPECTS, MS, S, ShardBench, item, lock_id, slot
 from world_parts import LOCKS, V, W, content, drop, fork, of, write
 
-from enact_dist.core.datum import Position, Token
-from enact_dist.core.message_parts import CAUSE_FORK
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.datum import Position, Token
+from enact_dist.core.protocol.messages import (
     AspectEntry,
     Commit,
     DatumRead,
@@ -29,9 +28,9 @@ from enact_dist.core.messages import (
     WorldEntry,
     WriteItem,
 )
-from enact_dist.core.records import SlotRecord, WorldRecord
-from enact_dist.core.slots import NOTHING
-from enact_dist.core.worlds import CHANGES_MAX, FORK_WAIT_NS
+from enact_dist.core.protocol.parts import CAUSE_FORK
+from enact_dist.core.protocol.records import NOTHING, SlotRecord, WorldRecord
+from enact_dist.core.shard.on_world import CHANGES_MAX, FORK_WAIT_NS
 from enact_dist.terms import NullReason
 
 

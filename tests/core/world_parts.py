@@ -6,7 +6,7 @@ from itertools import count
 
 from shard_bench import lock_id, slot
 
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.messages import (
     DropWorld,
     Fork,
     Item,

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from enact_dist.cli.main import build_parser
-from enact_dist.config import load_config
+from enact_dist.config.read import load_config
 
 ACTORS = Path(__file__).parents[2] / "actors"
 TEXT = (Path(__file__).parents[2] / "deploy" / "compose.yaml").read_text("utf-8")

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from enact_dist.cli.main import build_parser
-from enact_dist.config import load_config
+from enact_dist.config.read import load_config
 
 ROOT = Path(__file__).parents[2]
 OWN = ROOT / "deploy" / "own"

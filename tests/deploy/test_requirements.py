@@ -102,7 +102,7 @@ def test_every_pip_line_works_from_a_clone():
     extras = PROJECT["project"]["optional-dependencies"].keys()
     found = list(pip_lines())
 
-    assert {"README.md", "enact_dist/doctor.py"} <= {place for place, _ in found}
+    assert {"README.md", "enact_dist/operate/doctor.py"} <= {place for place, _ in found}
     for place, what in found:
         path, _, wanted = what.rstrip("]").partition("[")
         assert path in {".", "/path/to/enact-dist"}, (place, what)

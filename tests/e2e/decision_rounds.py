@@ -20,7 +20,7 @@ from accounts import COUNT, LEFT, RIGHT, open_accounts, start_trapped
 
 from enact_dist import Lock, View, Write, connect
 from enact_dist.errors import CommitUnknownError, LeaseLostError, ShardUnreachableError
-from enact_dist.link import client as link_client
+from enact_dist.link.client import locks as link_client
 
 PRIMARY, PARTICIPANT = "s0", "s1"
 STEP_AT = {

@@ -22,10 +22,10 @@ import sys
 import threading
 
 from enact_dist.cli.main import main
-from enact_dist.core.messages import Finish
-from enact_dist.core.records import DecisionRecord, PreparedEnded, PreparedRecord
-from enact_dist.link.shard_calls import ShardCalls
-from enact_dist.link.store import Store
+from enact_dist.core.protocol.messages import Finish
+from enact_dist.core.protocol.records import DecisionRecord, PreparedEnded, PreparedRecord
+from enact_dist.link.daemon.shard_calls import ShardCalls
+from enact_dist.link.store.store import Store
 
 BEFORE_WRITE = {"all-prepared": DecisionRecord, "finishing": PreparedEnded}
 AFTER_WRITE = {"decided": DecisionRecord, "prepared": PreparedRecord}

@@ -6,7 +6,7 @@ import pytest
 from accounts import two_shards
 from decision_rounds import STEP_AT, DecisionRounds, figures_to
 
-from enact_dist.link import client as link_client
+from enact_dist.link.client import locks as link_client
 
 pytestmark = pytest.mark.slow
 ROUNDS = int(os.environ.get("ENACT_DECISION_KILLS", "4"))

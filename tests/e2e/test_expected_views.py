@@ -9,7 +9,7 @@ import pytest
 from accounts import COUNT, LEFT, RIGHT, open_accounts, start_trapped, two_trapped_shards
 
 from enact_dist import Lock, Read, View, Write, connect, local
-from enact_dist.core.messages import Commit
+from enact_dist.core.protocol.messages import Commit
 from enact_dist.errors import (
     ChangedError,
     CommitUnknownError,
@@ -17,7 +17,7 @@ from enact_dist.errors import (
     MisuseError,
     ShardUnreachableError,
 )
-from enact_dist.link import client as link_client
+from enact_dist.link.client import locks as link_client
 from enact_dist.verify.checker import Checker, LockStory, Reading, State, Told
 
 pytestmark = pytest.mark.slow

@@ -10,7 +10,7 @@ from accounts import COUNT, LEFT, RIGHT, open_accounts, start_trapped, two_trapp
 
 from enact_dist import Lock, View, Write, connect
 from enact_dist.errors import CommitUnknownError
-from enact_dist.link import client as link_client
+from enact_dist.link.client import locks as link_client
 
 pytestmark = pytest.mark.slow
 ANSWER_S = "4"

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from enact_dist import Entity, Lock, View, Write, connect
-from enact_dist.core.messages import Survey
+from enact_dist.core.protocol.messages import Survey
 from enact_dist.errors import LeaseLostError, NoRoomError
 from enact_dist.terms import Aspect, Durability
 

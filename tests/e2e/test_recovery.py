@@ -3,7 +3,7 @@
 import pytest
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
-from enact_dist.link.pauses import Pauses
+from enact_dist.link.client.pauses import Pauses
 from enact_dist.verify.recovery import measure
 
 pytestmark = pytest.mark.slow

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 from ports import free_endpoint
 
-from enact_dist.core.datum import Datum, LockId, Slot
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.datum import Datum, LockId, Slot
+from enact_dist.core.protocol.messages import (
     Acquire,
     AspectEntry,
     Commit,
@@ -27,9 +27,9 @@ from enact_dist.core.messages import (
     Stage,
     WriteItem,
 )
-from enact_dist.core.shard_state import ShardSettings
+from enact_dist.core.shard.state import ShardSettings
 from enact_dist.link.log import in_words
-from enact_dist.link.socket_frames import Kind, Stream, greeting_of, send_frame
+from enact_dist.link.socket.frames import Kind, Stream, greeting_of, send_frame
 from enact_dist.terms import Access
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -130,7 +130,7 @@ def free_endpoints():
 @pytest.fixture
 def daemon(make_settings):
     """Start shards in this process: `daemon(endpoint, name=…)`; stopped after the test."""
-    from enact_dist.link.shard_daemon import DaemonSettings, start_shard
+    from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
 
     running = []
 
@@ -149,8 +149,8 @@ def daemon(make_settings):
 @pytest.fixture(autouse=True)
 def _patient_sockets(monkeypatch):
     """A process that stands still has its socket all the same: what is tested is not the pause."""
-    monkeypatch.setattr("enact_dist.link.socket_line.CONNECT_S", 30.0)
-    monkeypatch.setattr("enact_dist.link.socket_connection.OPEN_S", 60.0)
+    monkeypatch.setattr("enact_dist.link.socket.line.CONNECT_S", 30.0)
+    monkeypatch.setattr("enact_dist.link.socket.connection.OPEN_S", 60.0)
 
 
 @pytest.fixture(autouse=True)
@@ -169,8 +169,8 @@ def carry(request):
 
     Parametrised indirectly with "socket" they are socket carriers that have met shard `s0`.
     """
-    from enact_dist.link.socket_carrier import SocketCarrier
-    from enact_dist.link.zenoh_carrier import ZenohCarrier
+    from enact_dist.link.socket.carrier import SocketCarrier
+    from enact_dist.link.zenoh.carrier import ZenohCarrier
 
     opened = []
     over_socket = getattr(request, "param", "zenoh") == "socket"
@@ -260,9 +260,9 @@ def raw(daemon, endpoint):
 DAEMON = """
 import sys
 from pathlib import Path
-from enact_dist.core.messages import AspectEntry, PlacementMap, ShardEntry
-from enact_dist.core.shard_state import ShardSettings
-from enact_dist.link.shard_daemon import DaemonSettings, run_shard
+from enact_dist.core.protocol.messages import AspectEntry, PlacementMap, ShardEntry
+from enact_dist.core.shard.state import ShardSettings
+from enact_dist.link.daemon.daemon import DaemonSettings, run_shard
 endpoint, folder, log, durability = sys.argv[1:]
 shard = ShardSettings(
     "s0",

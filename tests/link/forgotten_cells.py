@@ -8,11 +8,11 @@ from rebalance_cells import POSE, placement
 from store_writer import persist
 
 from enact_dist import Aspect, Lock, Write
-from enact_dist.core.messages import AspectEntry
-from enact_dist.core.placement import shard_of
-from enact_dist.core.records import AspectRecord
-from enact_dist.link.forgetting import forget
-from enact_dist.link.store import open_store, read_store
+from enact_dist.core.protocol.messages import AspectEntry
+from enact_dist.core.protocol.placement import shard_of
+from enact_dist.core.protocol.records import AspectRecord
+from enact_dist.link.offline.forgetting import forget
+from enact_dist.link.store.store import open_store, read_store
 
 TWO_NAMES = ("left", "right")
 TWO = placement(*TWO_NAMES)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from typing import Any
 
-from enact_dist.core.messages import AwaitStamp, Hello, Welcome
+from enact_dist.core.protocol.messages import AwaitStamp, Hello, Welcome
 
 
 def parked(carrier: Any, wait_s: float, *, ttl_s: float = 60.0) -> AwaitStamp:

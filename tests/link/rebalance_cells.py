@@ -20,8 +20,8 @@ from enact_dist import (
     Write,
     local,
 )
-from enact_dist.core.messages import Pin, PlacementMap, ShardEntry
-from enact_dist.core.placement import shard_of
+from enact_dist.core.protocol.messages import Pin, PlacementMap, ShardEntry
+from enact_dist.core.protocol.placement import shard_of
 from enact_dist.errors import ForgottenError, NullDatumError
 
 POSE = Aspect("pose", list, Durability.DURABLE, retention=Retention(versions=3))

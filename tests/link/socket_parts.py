@@ -3,7 +3,7 @@
 import pytest
 
 from enact_dist import Aspect, Durability, Entity, Lock, Write
-from enact_dist.link.socket_frames import Stream, send_frame
+from enact_dist.link.socket.frames import Stream, send_frame
 from enact_dist.wire.frames import decode_frame, encode_frame
 
 COUNT = Aspect("count", int, Durability.VOLATILE)

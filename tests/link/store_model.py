@@ -5,8 +5,8 @@ from dataclasses import replace
 
 from store_workload import flat_record
 
-from enact_dist.core.ledger import Ledger
-from enact_dist.core.records import SessionEnded, SessionRecord, SlotRecord
+from enact_dist.core.offline.ledger import Ledger
+from enact_dist.core.protocol.records import SessionEnded, SessionRecord, SlotRecord
 from enact_dist.terms import Durability
 
 LARGE_BYTES = 64 * 1024

@@ -16,8 +16,8 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from enact_dist.core.datum import Datum, LockId, Position, Slot, Token
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.datum import Datum, LockId, Position, Slot, Token
+from enact_dist.core.protocol.messages import (
     RESOLVED_ABORTED,
     RESOLVED_COMMITTED,
     Acquire,
@@ -45,16 +45,24 @@ from enact_dist.core.messages import (
     SlotVersion,
     WriteItem,
 )
-from enact_dist.core.records import Call, Called, Persist, Persisted, Reply, SlotRecord, Tick
-from enact_dist.core.shard import Shard
-from enact_dist.core.shard_state import ShardSettings
-from enact_dist.link import store as store_module
-from enact_dist.link import store_mark
-from enact_dist.link.blobs import BlobFolder
-from enact_dist.link.store import open_store
-from enact_dist.link.store_database import Database
-from enact_dist.link.store_mark import MarkFile
-from enact_dist.link.store_states import States
+from enact_dist.core.protocol.records import (
+    Call,
+    Called,
+    Persist,
+    Persisted,
+    Reply,
+    SlotRecord,
+    Tick,
+)
+from enact_dist.core.shard.shard import Shard
+from enact_dist.core.shard.state import ShardSettings
+from enact_dist.link.folder import mark as store_mark
+from enact_dist.link.folder.blobs import BlobFolder
+from enact_dist.link.folder.mark import MarkFile
+from enact_dist.link.store import store as store_module
+from enact_dist.link.store.database import Database
+from enact_dist.link.store.states import States
+from enact_dist.link.store.store import open_store
 from enact_dist.terms import Access
 
 ASPECTS = {"kept": "durable", "swift": "os", "volatile": "volatile"}

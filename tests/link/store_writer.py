@@ -13,11 +13,11 @@ import threading
 import zlib
 from pathlib import Path
 
-from enact_dist.core.datum import Datum, LockId, Position, Slot
-from enact_dist.core.messages import SlotVersion
-from enact_dist.core.records import OutcomeRecord, Persist, SlotRecord
-from enact_dist.link.store import open_store, read_store
-from enact_dist.link.store_thread import StoreThread
+from enact_dist.core.protocol.datum import Datum, LockId, Position, Slot
+from enact_dist.core.protocol.messages import SlotVersion
+from enact_dist.core.protocol.records import OutcomeRecord, Persist, SlotRecord
+from enact_dist.link.store.store import open_store, read_store
+from enact_dist.link.store.thread import StoreThread
 from enact_dist.terms import Durability
 
 GROUPS = 3

@@ -9,8 +9,8 @@ import pytest
 from store_writer import fill, versions
 
 from enact_dist.errors import StoreError
-from enact_dist.link.backup_digests import BACKUP_FILE, read_sealed, sealed
-from enact_dist.link.store_copy import back_up, restore
+from enact_dist.link.offline.backup import back_up, restore
+from enact_dist.link.offline.backup_files import BACKUP_FILE, read_sealed, sealed
 
 NAMES = {"cell": "line", "shard": "left"}
 

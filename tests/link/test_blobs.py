@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from enact_dist.link.blobs import Blob, BlobFolder, DamagedBlobError
+from enact_dist.link.folder.blobs import Blob, BlobFolder, DamagedBlobError
 
 BODY = random.Random(1).randbytes(2_500_001)
 
@@ -133,7 +133,7 @@ def test_error_of_the_disk_is_a_fault_of_the_content(blobs, tmp_path, monkeypatc
     def broken(descriptor, parts):
         raise OSError(5, "Input/output error")
 
-    monkeypatch.setattr("enact_dist.link.blobs.os.readv", broken)
+    monkeypatch.setattr("enact_dist.link.folder.blobs.os.readv", broken)
     assert "cannot be read: Input/output error" in found.fault()
 
 

@@ -7,11 +7,11 @@ import time
 import pytest
 
 from enact_dist import Aspect, Durability, Entity, Lock, Read, View, Write, connect
-from enact_dist.core import quotas
-from enact_dist.core.messages import ListSessions, Pin, PlacementMap, ShardEntry
-from enact_dist.core.shard_state import ShardSettings
+from enact_dist.core.protocol.messages import ListSessions, Pin, PlacementMap, ShardEntry
+from enact_dist.core.shard import quotas
+from enact_dist.core.shard.state import ShardSettings
 from enact_dist.errors import LinkError, MisuseError, ProtocolError, ShardUnreachableError
-from enact_dist.link.shard_daemon import DaemonSettings, start_shard
+from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
 
 COUNT = Aspect("count", int, Durability.VOLATILE)
 KEPT = Aspect("kept", int)

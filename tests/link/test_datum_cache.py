@@ -2,8 +2,8 @@
 
 import pytest
 
-from enact_dist.core.datum import Datum, Slot
-from enact_dist.link.datum_cache import CACHED_BYTES_MIN, DatumCache
+from enact_dist.core.protocol.datum import Datum, Slot
+from enact_dist.link.client.fetch import CACHED_BYTES_MIN, DatumCache
 
 CUP, PLATE, TRAY = (Slot("online", entity, "image") for entity in ("cup", "plate", "tray"))
 KNOWN = ("s0", 1)

@@ -5,9 +5,9 @@ import threading
 
 import pytest
 
-from enact_dist.core.messages import Granted, ListLocks, ListSessions, Locks
+from enact_dist.core.protocol.messages import Granted, ListLocks, ListSessions, Locks
 from enact_dist.errors import MisuseError, ShardUnreachableError
-from enact_dist.link.embedded import EmbeddedCarrier
+from enact_dist.link.daemon.embedded import EmbeddedCarrier
 from enact_dist.link.host import open_host
 
 

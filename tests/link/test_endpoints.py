@@ -8,8 +8,8 @@ from ports import free_endpoint
 
 from enact_dist import connect
 from enact_dist.errors import ShardUnreachableError
-from enact_dist.link import endpoints
-from enact_dist.link.endpoints import somebody_listens, unknown_hosts
+from enact_dist.link.zenoh import endpoints
+from enact_dist.link.zenoh.endpoints import somebody_listens, unknown_hosts
 
 
 @pytest.fixture

@@ -7,12 +7,12 @@ import logging
 import pytest
 from store_writer import fill, persist, slot_record, versions
 
-from enact_dist.core.message_parts import PlacementMap, ShardEntry
-from enact_dist.core.shard_state import ShardSettings
+from enact_dist.core.protocol.parts import PlacementMap, ShardEntry
+from enact_dist.core.shard.state import ShardSettings
 from enact_dist.errors import StoreError
 from enact_dist.link.host import open_host
-from enact_dist.link.store import open_store
-from enact_dist.link.store_copy import back_up, restore
+from enact_dist.link.offline.backup import back_up, restore
+from enact_dist.link.store.store import open_store
 
 NAMES = {"cell": "line", "shard": "left"}
 SETTINGS = ShardSettings("left", PlacementMap(1, (ShardEntry("left", ()),), ()))

@@ -5,7 +5,7 @@ import os
 
 import pytest
 
-from enact_dist.link.folder_lock import replace_file
+from enact_dist.link.folder.lock import replace_file
 
 
 def test_file_is_whole_where_the_disk_takes_it_in_parts(tmp_path, monkeypatch):

@@ -20,15 +20,15 @@ from rebalance_cells import ENTITIES, POSE, StoppedCell, placement
 from store_writer import persist, slot_record
 
 from enact_dist import Aspect, Lock, Position, View, Write, local
-from enact_dist.core.datum import LockId, Slot, Token
-from enact_dist.core.messages import AspectEntry, Item, SlotVersion, WriteItem
-from enact_dist.core.placement import shard_of
-from enact_dist.core.records import AspectRecord, DecisionRecord, PreparedRecord
+from enact_dist.core.protocol.datum import LockId, Slot, Token
+from enact_dist.core.protocol.messages import AspectEntry, Item, SlotVersion, WriteItem
+from enact_dist.core.protocol.placement import shard_of
+from enact_dist.core.protocol.records import AspectRecord, DecisionRecord, PreparedRecord
 from enact_dist.errors import DatumTypeError, ForgottenError, MisuseError, StoreError
-from enact_dist.link.folder_marks import mark
-from enact_dist.link.forgetting import forget, look
-from enact_dist.link.store import open_store, read_store
-from enact_dist.link.store_folder import moving_mark
+from enact_dist.link.folder.folder import moving_mark
+from enact_dist.link.folder.marks import mark
+from enact_dist.link.offline.forgetting import forget, look
+from enact_dist.link.store.store import open_store, read_store
 from enact_dist.terms import Access
 
 

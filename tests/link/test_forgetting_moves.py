@@ -16,13 +16,13 @@ from rebalance_cells import ENTITIES, POSE, StoppedCell, placement
 from store_writer import persist
 
 from enact_dist import Entities, Position, View, ViewEach
-from enact_dist.core.messages import AspectEntry
-from enact_dist.core.placement import shard_of
-from enact_dist.core.records import AspectRecord
+from enact_dist.core.protocol.messages import AspectEntry
+from enact_dist.core.protocol.placement import shard_of
+from enact_dist.core.protocol.records import AspectRecord
 from enact_dist.errors import ForgottenError, StoreError
-from enact_dist.link.forgetting import forget, look
-from enact_dist.link.rebalance import rebalance
-from enact_dist.link.store import open_store
+from enact_dist.link.offline.forgetting import forget, look
+from enact_dist.link.offline.rebalance import rebalance
+from enact_dist.link.store.store import open_store
 
 
 def test_versions_are_never_used_again_where_an_entity_moves(tmp_path):

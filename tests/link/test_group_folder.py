@@ -8,8 +8,8 @@ import pytest
 from test_payload_desk import FILE, SIZE, adopted, names, stage
 
 from enact_dist import Aspect, Durability, Entity, Lock, View, Write, connect
-from enact_dist.link.payload_desk import PayloadDesk
-from enact_dist.link.shared_folder import SharedFolder
+from enact_dist.link.memory.payload_desk import PayloadDesk
+from enact_dist.link.memory.shared_folder import SharedFolder
 
 STRANGER = 65534
 

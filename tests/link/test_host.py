@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.messages import (
     AwaitStamp,
     Committed,
     Granted,
@@ -15,11 +15,11 @@ from enact_dist.core.messages import (
     Refused,
     Waiting,
 )
-from enact_dist.core.records import Recovered
-from enact_dist.core.shard import Shard
+from enact_dist.core.protocol.records import Recovered
+from enact_dist.core.shard.shard import Shard
 from enact_dist.errors import StoreError
 from enact_dist.link.clock import SystemClock
-from enact_dist.link.embedded import EmbeddedCarrier
+from enact_dist.link.daemon.embedded import EmbeddedCarrier
 from enact_dist.link.host import ShardHost, open_host
 
 

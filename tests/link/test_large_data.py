@@ -19,11 +19,11 @@ from enact_dist import (
     Write,
     connect,
 )
-from enact_dist.core.messages import Pin, PlacementMap, ShardEntry
-from enact_dist.core.shard_state import ShardSettings
+from enact_dist.core.protocol.messages import Pin, PlacementMap, ShardEntry
+from enact_dist.core.shard.state import ShardSettings
 from enact_dist.errors import LeaseLostError
-from enact_dist.link.blobs import BlobFolder
-from enact_dist.link.shard_daemon import DaemonSettings, start_shard
+from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
+from enact_dist.link.folder.blobs import BlobFolder
 
 CLOUD = Aspect("cloud", np.ndarray, Durability.VOLATILE)
 TTL_S = 8.0

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from enact_dist.core.datum import Datum, LockId, Slot, Token
-from enact_dist.core.messages import Commit, Stage, Staged, WriteItem
-from enact_dist.link.payload_desk import PayloadDesk
-from enact_dist.link.shared_folder import SharedFolder
-from enact_dist.link.used_names import NUMBERS_MAX
+from enact_dist.core.protocol.datum import Datum, LockId, Slot, Token
+from enact_dist.core.protocol.messages import Commit, Stage, Staged, WriteItem
+from enact_dist.link.memory.names import NUMBERS_MAX
+from enact_dist.link.memory.payload_desk import PayloadDesk
+from enact_dist.link.memory.shared_folder import SharedFolder
 
 SIZE = 100_000
 SESSION = "a1b2c3"

@@ -6,9 +6,9 @@ import msgpack
 import pytest
 
 from enact_dist import Aspect, Durability, Entities, Entity, Lock, WriteEach, connect
-from enact_dist.core import pages
-from enact_dist.core.datum import LockId, Position, Slot
-from enact_dist.core.messages import (
+from enact_dist.core.protocol import pages
+from enact_dist.core.protocol.datum import LockId, Position, Slot
+from enact_dist.core.protocol.messages import (
     Alive,
     AwaitStamp,
     Hello,
@@ -20,9 +20,9 @@ from enact_dist.core.messages import (
     SlotVersion,
     Welcome,
 )
-from enact_dist.core.records import Reply
+from enact_dist.core.protocol.records import Reply
 from enact_dist.errors import MisuseError
-from enact_dist.link.shard_health import of_endpoint
+from enact_dist.link.daemon.health import of_endpoint
 from enact_dist.wire import frames
 
 SESSIONS = 300

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from enact_dist.link.memory import (
+from enact_dist.link.memory.maps import (
     AT_ONCE_BYTES,
     STEP_BYTES,
     Leftovers,

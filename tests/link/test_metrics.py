@@ -13,14 +13,13 @@ from pathlib import Path
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from enact_dist.core.latencies import Latencies
-from enact_dist.core.messages import AspectEntry, Committed, PlacementMap, ShardEntry
-from enact_dist.core.shard_state import ShardSettings
+from enact_dist.core.protocol.messages import AspectEntry, Committed, PlacementMap, ShardEntry
+from enact_dist.core.shard.state import ShardSettings
+from enact_dist.core.state.clock import Latencies
 from enact_dist.errors import LinkError
-from enact_dist.link import metrics_server
+from enact_dist.link.daemon import metrics
+from enact_dist.link.daemon.metrics import CONTENT_TYPE, METRICS, MetricsServer, page, table
 from enact_dist.link.host import open_host
-from enact_dist.link.metrics import CONTENT_TYPE, METRICS, page, table
-from enact_dist.link.metrics_server import MetricsServer
 
 DOCUMENT = Path(__file__).parents[2] / "deploy" / "metrics.md"
 DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))
@@ -151,7 +150,7 @@ def test_other_paths_are_not_found(served):
 def test_readers_that_do_not_read_leave_the_shard_alone(served, host, monkeypatch):
     """They hold a few threads; one more is turned away, and when they go others are served."""
     address = ("127.0.0.1", served.server.port)
-    idle = [socket.create_connection(address) for _ in range(metrics_server.READERS_MAX)]
+    idle = [socket.create_connection(address) for _ in range(metrics.READERS_MAX)]
     with pytest.raises(
         (http.client.RemoteDisconnected, ConnectionResetError, urllib.error.URLError)
     ):
@@ -174,7 +173,7 @@ def test_readers_that_do_not_read_leave_the_shard_alone(served, host, monkeypatc
 def test_reader_that_cannot_be_taken_is_looked_for_after_a_pause(served, monkeypatch, caplog):
     """While no descriptor is free its connection stays at the door, and the server does not spin."""
     tries = []
-    accept = metrics_server.TCPServer.get_request
+    accept = metrics.TCPServer.get_request
 
     def refused(server):
         tries.append(time.monotonic())
@@ -182,7 +181,7 @@ def test_reader_that_cannot_be_taken_is_looked_for_after_a_pause(served, monkeyp
             raise OSError(errno.EMFILE, "Too many open files")
         return accept(server)
 
-    monkeypatch.setattr(metrics_server.TCPServer, "get_request", refused)
+    monkeypatch.setattr(metrics.TCPServer, "get_request", refused)
     text = served()
 
     pauses = [later - earlier for earlier, later in itertools.pairwise(tries)]
@@ -206,8 +205,8 @@ def test_readers_for_whom_there_was_no_thread_take_no_place(served, monkeypatch)
         raise RuntimeError("can't start new thread")
 
     with monkeypatch.context() as patch:
-        patch.setattr(metrics_server.ThreadingMixIn, "process_request", refused)
-        for _ in range(metrics_server.READERS_MAX):
+        patch.setattr(metrics.ThreadingMixIn, "process_request", refused)
+        for _ in range(metrics.READERS_MAX):
             with pytest.raises(OSError, match=r"closed|reset"):
                 served()
 

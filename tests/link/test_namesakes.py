@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import pytest
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
-from enact_dist.cli.shard import _state
-from enact_dist.core.messages import (
+from enact_dist.cli.shard.shard import _state
+from enact_dist.core.protocol.messages import (
     ListPlaces,
     ListSessions,
     Pin,
@@ -17,13 +17,13 @@ from enact_dist.core.messages import (
     Sessions,
     ShardEntry,
 )
-from enact_dist.core.records import Compare
-from enact_dist.core.shard_state import ShardSettings
-from enact_dist.doctor_cell import namesakes
+from enact_dist.core.protocol.records import Compare
+from enact_dist.core.shard.state import ShardSettings
 from enact_dist.errors import LinkError
-from enact_dist.link.namesakes import Comparing, Doubts, Serving, moved_places, serving
-from enact_dist.link.shard_daemon import DaemonSettings, start_shard
-from enact_dist.link.zenoh_discovery import FoundShard
+from enact_dist.link.client.namesakes import Comparing, Doubts, Serving, moved_places, serving
+from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
+from enact_dist.link.zenoh.discovery import FoundShard
+from enact_dist.operate.doctor_cell import namesakes
 
 COUNT = Aspect("count", int)
 ASK_S = 10.0
@@ -33,7 +33,7 @@ ASK_S = 10.0
 @pytest.fixture
 def begin(tmp_path, monkeypatch, carrier):
     """Start shards of a cell: `begin(name, listen, left=…, right=…)`; stopped after the test."""
-    monkeypatch.setattr("enact_dist.link.shard_daemon.PROBE_S", ASK_S)
+    monkeypatch.setattr("enact_dist.link.daemon.daemon.PROBE_S", ASK_S)
     monkeypatch.setattr(Doubts, "ASK_S", ASK_S)
     monkeypatch.setattr(Doubts, "AGAIN_S", 0.0)
     monkeypatch.setattr(Comparing, "ASK_S", ASK_S)
@@ -200,8 +200,8 @@ def test_daemon_that_restarts_between_two_questions_is_one(monkeypatch):
     def ask(*_, **__):
         return {shard: Pong("left", 1, True, "", 0, next(starts))}
 
-    monkeypatch.setattr("enact_dist.link.namesakes.somebody_listens", lambda _: True)
-    monkeypatch.setattr("enact_dist.link.namesakes.ask_shards", ask)
+    monkeypatch.setattr("enact_dist.link.client.namesakes.somebody_listens", lambda _: True)
+    monkeypatch.setattr("enact_dist.link.client.namesakes.ask_shards", ask)
 
     found = serving("cell", "left", ("tcp/127.0.0.1:1", "tcp/127.0.0.1:2"), timeout_s=ASK_S)
 
@@ -214,7 +214,9 @@ def test_shard_that_ran_twice_is_asked_about_after_one_of_them_was_silent(monkey
     answers = iter((both, both[:1], both[:1], both))
     monkeypatch.setattr(Comparing, "AGAIN_S", 0.01)
     monkeypatch.setattr(Comparing, "LATER_S", 0.01)
-    monkeypatch.setattr("enact_dist.link.namesakes.serving", lambda *_, **__: next(answers, both))
+    monkeypatch.setattr(
+        "enact_dist.link.client.namesakes.serving", lambda *_, **__: next(answers, both)
+    )
     told = queue.SimpleQueue()
     comparing = Comparing("cell", told.put)
     try:

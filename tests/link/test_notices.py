@@ -8,11 +8,11 @@ import time
 
 import pytest
 
-from enact_dist.core.datum import Slot
-from enact_dist.core.messages import Notice, Survey
+from enact_dist.core.protocol.datum import Slot
+from enact_dist.core.protocol.messages import Notice, Survey
 from enact_dist.link.notices import Interest, NoticeQueue, Skipped
-from enact_dist.link.socket_frames import prefixed
-from enact_dist.link.socket_line import Connection
+from enact_dist.link.socket.frames import prefixed
+from enact_dist.link.socket.line import Connection
 from enact_dist.wire.frames import encode_frame
 
 

@@ -6,15 +6,17 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from enact_dist.core import messages as m
-from enact_dist.core import owners, parked, quotas, sessions
-from enact_dist.core.datum import Datum, LockId, Position, Slot
+from enact_dist.core.protocol import messages as m
+from enact_dist.core.protocol.datum import Datum, LockId, Position, Slot
+from enact_dist.core.shard import owners, parked, quotas
+from enact_dist.core.state import sessions
 from enact_dist.errors import PermissionDeniedError, ProtocolError
-from enact_dist.link import payload_desk, socket_service
+from enact_dist.link.memory import payload_desk
 from enact_dist.link.refusals import error_of
-from enact_dist.link.socket_frames import Kind
-from enact_dist.link.zenoh_carrier import wait_connected
-from enact_dist.link.zenoh_config import MESSAGE_BYTES_MAX, close_session, open_session
+from enact_dist.link.socket import service as socket_service
+from enact_dist.link.socket.frames import Kind
+from enact_dist.link.zenoh.carrier import wait_connected
+from enact_dist.link.zenoh.config import MESSAGE_BYTES_MAX, close_session, open_session
 from enact_dist.wire.frames import decode_frame, encode_frame
 from enact_dist.wire.keys import request_key, verb_of
 from enact_dist.wire.limits import COMMIT_BYTES_MAX, FRAME_BYTES_MAX
@@ -159,7 +161,7 @@ def test_stranger_uses_up_no_data_that_wait_for_their_commit(
 
 GREETS_AND_ENDS = """
 import socket, sys
-from enact_dist.link.socket_frames import Kind, Stream, greeting_of, send_frame
+from enact_dist.link.socket.frames import Kind, Stream, greeting_of, send_frame
 near = socket.socket(socket.AF_UNIX)
 near.connect(sys.argv[1])
 send_frame(near, greeting_of(sys.argv[2], "eve@h:1"), kind=Kind.OPEN)
@@ -189,9 +191,9 @@ def test_process_that_greets_for_a_session_of_zenoh_does_not_end_it_with_its_own
 
 RELEASES_ANOTHERS = """
 import socket, sys
-from enact_dist.core.datum import LockId
-from enact_dist.core.messages import Release
-from enact_dist.link.socket_frames import Kind, Stream, greeting_of, send_frame
+from enact_dist.core.protocol.datum import LockId
+from enact_dist.core.protocol.messages import Release
+from enact_dist.link.socket.frames import Kind, Stream, greeting_of, send_frame
 from enact_dist.wire.frames import decode_frame, encode_frame
 near = socket.socket(socket.AF_UNIX)
 near.connect(sys.argv[1])

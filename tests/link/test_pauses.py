@@ -5,9 +5,9 @@ import weakref
 
 import pytest
 
-from enact_dist.core.client import Client
-from enact_dist.core.datum import Token
-from enact_dist.core.messages import (
+from enact_dist.core.client.client import Client
+from enact_dist.core.protocol.datum import Token
+from enact_dist.core.protocol.messages import (
     Acquire,
     Alive,
     Granted,
@@ -19,9 +19,9 @@ from enact_dist.core.messages import (
     ShardEntry,
     Welcome,
 )
-from enact_dist.link import socket_line
-from enact_dist.link.client import CellClient
-from enact_dist.link.pauses import Pauses, keep_renewing
+from enact_dist.link.client.locks import CellClient
+from enact_dist.link.client.pauses import Pauses, keep_renewing
+from enact_dist.link.socket import line as socket_line
 from enact_dist.terms import Access
 
 TTL_NS = 2 * 10**9

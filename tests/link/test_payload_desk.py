@@ -7,12 +7,12 @@ from types import SimpleNamespace
 
 import pytest
 
-from enact_dist.core.datum import Datum, LockId, Slot, Token
-from enact_dist.core.messages import Commit, Refused, Stage, Staged, WriteItem
-from enact_dist.link import payload_desk
-from enact_dist.link.memory import leftovers
-from enact_dist.link.payload_desk import NO_ROOM, PayloadDesk
-from enact_dist.link.shared_folder import SharedFolder
+from enact_dist.core.protocol.datum import Datum, LockId, Slot, Token
+from enact_dist.core.protocol.messages import Commit, Refused, Stage, Staged, WriteItem
+from enact_dist.link.memory import payload_desk
+from enact_dist.link.memory.maps import leftovers
+from enact_dist.link.memory.payload_desk import NO_ROOM, PayloadDesk
+from enact_dist.link.memory.shared_folder import SharedFolder
 from enact_dist.testing import ManualClock
 
 SIZE = 100_000

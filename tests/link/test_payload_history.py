@@ -5,8 +5,8 @@ import pytest
 
 from enact_dist import Aspect, Durability, Entity, Lock, View, Write, connect
 from enact_dist.errors import ForgottenError, NoRoomError
-from enact_dist.link.memory import leftovers
-from enact_dist.link.shard_daemon import DaemonSettings, start_shard
+from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
+from enact_dist.link.memory.maps import leftovers
 
 CLOUD = Aspect("cloud", np.ndarray, Durability.VOLATILE, retention=10)
 TRAY = Entity("tray")

@@ -10,15 +10,20 @@ import pytest
 from rebalance_cells import ENTITIES, LATE, POSE, StoppedCell, placement
 from store_writer import persist, slot_record
 
-from enact_dist.core.datum import LockId, Position, Token
-from enact_dist.core.messages import SlotVersion, WriteItem
-from enact_dist.core.placement import shard_of
-from enact_dist.core.records import DecisionRecord, PreparedRecord, SessionRecord, WorldRecord
+from enact_dist.core.protocol.datum import LockId, Position, Token
+from enact_dist.core.protocol.messages import SlotVersion, WriteItem
+from enact_dist.core.protocol.placement import shard_of
+from enact_dist.core.protocol.records import (
+    DecisionRecord,
+    PreparedRecord,
+    SessionRecord,
+    WorldRecord,
+)
 from enact_dist.errors import StoreError
-from enact_dist.link import rebalance as module
-from enact_dist.link.rebalance import look, rebalance
-from enact_dist.link.store import open_store, read_store
-from enact_dist.link.store_folder import moving_mark, refuse_strangers
+from enact_dist.link.folder.folder import moving_mark, refuse_strangers
+from enact_dist.link.offline import rebalance as module
+from enact_dist.link.offline.rebalance import look, rebalance
+from enact_dist.link.store.store import open_store, read_store
 
 TWO = placement("left", "right")
 THREE = placement("left", "right", "third", pins=[("part/0", "third")])

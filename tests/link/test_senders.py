@@ -5,9 +5,14 @@ from collections import Counter
 
 import pytest
 
-from enact_dist.core.messages import Registered
-from enact_dist.link import senders as module
-from enact_dist.link.senders import OUTSTANDING_BYTES_MAX, QUEUED_ANSWERS_MAX, Senders, size_of
+from enact_dist.core.protocol.messages import Registered
+from enact_dist.link.zenoh import senders as module
+from enact_dist.link.zenoh.senders import (
+    OUTSTANDING_BYTES_MAX,
+    QUEUED_ANSWERS_MAX,
+    Senders,
+    size_of,
+)
 
 
 class FakeParcel:

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from enact_dist.link.service_manager import ServiceManager
+from enact_dist.link.daemon.service_manager import ServiceManager
 
 
 @pytest.fixture(params=["path", "abstract"])

@@ -6,9 +6,8 @@ import time
 
 import pytest
 
-from enact_dist.core import prepares
-from enact_dist.core.datum import Datum, LockId, Position, Slot, Token
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.datum import Datum, LockId, Position, Slot, Token
+from enact_dist.core.protocol.messages import (
     Finish,
     Finished,
     Prepare,
@@ -18,9 +17,11 @@ from enact_dist.core.messages import (
     ShardEntry,
     WriteItem,
 )
+from enact_dist.core.shard import on_prepare as prepares
 from enact_dist.errors import LinkError
-from enact_dist.link import shard_calls, zenoh_config
-from enact_dist.link.shard_calls import ShardCalls
+from enact_dist.link.daemon import shard_calls
+from enact_dist.link.daemon.shard_calls import ShardCalls
+from enact_dist.link.zenoh import config as zenoh_config
 
 LOCK = LockId("0" * 32, 0, 1)
 RESOLVE = Resolve(LOCK, Token(1, 1), "s0")

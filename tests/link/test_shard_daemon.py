@@ -12,7 +12,7 @@ from parked_parts import parked
 from quiet_moments import judge, met_once
 
 from enact_dist import Aspect, Entity, connect
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.messages import (
     Committed,
     Granted,
     Item,
@@ -23,10 +23,10 @@ from enact_dist.core.messages import (
     Waiting,
 )
 from enact_dist.errors import ConfigError, LinkError, StoreError
-from enact_dist.link import shard_daemon
-from enact_dist.link.shard_daemon import DaemonSettings, start_shard
-from enact_dist.link.zenoh_config import close_session, open_session
-from enact_dist.link.zenoh_service import ZenohService
+from enact_dist.link.daemon import daemon as shard_daemon
+from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
+from enact_dist.link.zenoh.config import close_session, open_session
+from enact_dist.link.zenoh.service import ZenohService
 from enact_dist.terms import Access
 from enact_dist.wire.frames import decode_frame, encode_frame
 
@@ -284,9 +284,9 @@ def test_daemon_acknowledges_nothing_and_ends_with_status_1_when_its_disk_is_ful
 
 STOPPED = """
 import secrets, sys
-from enact_dist.core.messages import Fetch, Hello, Item, Register, AspectEntry, TakeView
-from enact_dist.core.datum import LockId, Slot
-from enact_dist.link.zenoh_carrier import ZenohCarrier
+from enact_dist.core.protocol.messages import Fetch, Hello, Item, Register, AspectEntry, TakeView
+from enact_dist.core.protocol.datum import LockId, Slot
+from enact_dist.link.zenoh.carrier import ZenohCarrier
 from enact_dist.terms import Access
 session = secrets.token_hex(16)
 carrier = ZenohCarrier("cell", session, "stopped", [sys.argv[1]], ttl_s=4.0)

@@ -11,10 +11,10 @@ import pytest
 import zenoh
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
-from enact_dist.core import messages as m
-from enact_dist.core.datum import Datum, LockId, Token
+from enact_dist.core.protocol import messages as m
+from enact_dist.core.protocol.datum import Datum, LockId, Token
 from enact_dist.errors import ProtocolError
-from enact_dist.link.zenoh_config import close_session, open_session
+from enact_dist.link.zenoh.config import close_session, open_session
 from enact_dist.wire.frames import decode_frame, encode_frame
 from enact_dist.wire.keys import request_key, verb_of
 from enact_dist.wire.limits import FRAME_VERSION
@@ -151,7 +151,7 @@ def test_shard_hears_on_after_a_frame_that_breaks_the_decoder(daemon, endpoint, 
             raise RecursionError("nested without end")
         return decode_frame(header, payload)
 
-    monkeypatch.setattr("enact_dist.link.zenoh_service.decode_request", broken)
+    monkeypatch.setattr("enact_dist.link.zenoh.service.decode_request", broken)
     refused, answered = raw((b"breaks", b""), (encode_frame(m.ListLocks())[0], b""))
 
     assert answer_of(refused) == m.Refused("protocol", "nested without end")
@@ -179,7 +179,7 @@ def test_shard_hears_on_after_a_request_that_fails_before_the_core(
 
 def test_slices_that_wait_for_their_place_are_bounded(daemon, endpoint, raw, monkeypatch):
     """While one waits for room, those beyond the limit are dropped, counted, and asked again."""
-    monkeypatch.setattr("enact_dist.link.zenoh_service.STAGED_BYTES_MAX", 100_000)
+    monkeypatch.setattr("enact_dist.link.zenoh.service.STAGED_BYTES_MAX", 100_000)
     shard, full = daemon(endpoint), threading.Event()
     take, count = shard.host._stage, shard.host.count
 

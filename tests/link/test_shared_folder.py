@@ -7,12 +7,12 @@ import time
 import pytest
 
 from enact_dist.errors import LinkError
-from enact_dist.link.shared_folder import NONCE, SharedFolder, address_in, open_shared
+from enact_dist.link.memory.shared_folder import NONCE, SharedFolder, address_in, open_shared
 
 HOLDER = """
 import sys
 from pathlib import Path
-from enact_dist.link.shared_folder import SharedFolder
+from enact_dist.link.memory.shared_folder import SharedFolder
 folder = SharedFolder("cell", "s0", root=Path(sys.argv[1]))
 (folder.path / "left.bin").write_bytes(b"x" * 1000)
 print(folder.name, flush=True)

@@ -6,9 +6,12 @@ from types import SimpleNamespace
 import pytest
 
 from enact_dist import Aspect, Entity, Lock, Write, local
-from enact_dist.core.client import Client, Peer
-from enact_dist.core.datum import Slot
-from enact_dist.core.messages import (
+from enact_dist.core.client.client import Client
+from enact_dist.core.client.own_commits import Unsettled
+from enact_dist.core.client.plan import Phase
+from enact_dist.core.client.session import Peer
+from enact_dist.core.protocol.datum import Slot
+from enact_dist.core.protocol.messages import (
     AspectEntry,
     AwaitStamp,
     Item,
@@ -20,13 +23,10 @@ from enact_dist.core.messages import (
     Welcome,
     WorldEntry,
 )
-from enact_dist.core.phase import Phase
-from enact_dist.core.unsettled import Unsettled
 from enact_dist.errors import ConfigError, LinkError
-from enact_dist.link.catalogue import KnownCatalogue
+from enact_dist.link.client.catalogue import PAUSE_NS, KnownCatalogue
+from enact_dist.link.client.session import SessionClient
 from enact_dist.link.clock import boottime_ns
-from enact_dist.link.further_shards import PAUSE_NS
-from enact_dist.link.session_client import SessionClient
 from enact_dist.terms import Access
 
 COUNT = AspectEntry("count", "f", "volatile")
@@ -390,7 +390,7 @@ def test_aspects_are_registered_again_while_another_thread_registers_one(session
     refused = SimpleNamespace(plan=plan, phase=None, refusal=code)
     client._catalogue.wants([COUNT])
     monkeypatch.setattr(client, "register", lambda **named: wanted.append(named["aspects"]))
-    monkeypatch.setattr("enact_dist.link.client.Refused", SimpleNamespace)
+    monkeypatch.setattr("enact_dist.link.client.locks.Refused", SimpleNamespace)
 
     assert client._begins_anew(refused, 0)
     assert wanted == [[COUNT]]

@@ -13,7 +13,7 @@ from quiet_moments import met_once
 from socket_parts import COUNT, CUP, add_one, carrier_of, over_socket
 
 from enact_dist import Entity, Lock, Write, connect
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.messages import (
     Hello,
     ListLocks,
     ListSessions,
@@ -21,10 +21,10 @@ from enact_dist.core.messages import (
     Reached,
 )
 from enact_dist.errors import ConfigError, LinkError
-from enact_dist.link.shared_folder import open_shared
-from enact_dist.link.socket_carrier import SocketCarrier
-from enact_dist.link.socket_line import SocketLine
-from enact_dist.link.zenoh_carrier import ZenohCarrier
+from enact_dist.link.memory.shared_folder import open_shared
+from enact_dist.link.socket.carrier import SocketCarrier
+from enact_dist.link.socket.line import SocketLine
+from enact_dist.link.zenoh.carrier import ZenohCarrier
 
 pytestmark = pytest.mark.carrier("auto")  # what is taken, and when, is what is tested
 

@@ -10,9 +10,9 @@ import time
 import pytest
 from socket_parts import ask, counters
 
-from enact_dist.core.datum import LockId
-from enact_dist.core.messages import Acquire, Hello, Item, ListLocks, Locks
-from enact_dist.link.socket_frames import Kind, Stream, greeting_of, prefixed, send_frame
+from enact_dist.core.protocol.datum import LockId
+from enact_dist.core.protocol.messages import Acquire, Hello, Item, ListLocks, Locks
+from enact_dist.link.socket.frames import Kind, Stream, greeting_of, prefixed, send_frame
 from enact_dist.terms import Access
 from enact_dist.wire.frames import encode_frame
 

@@ -5,9 +5,9 @@ import threading
 import pytest
 from socket_parts import over_socket, speak
 
-from enact_dist.core.messages import Alive, KeepAlive
-from enact_dist.link import socket_feed
-from enact_dist.link.socket_line import SocketLine
+from enact_dist.core.protocol.messages import Alive, KeepAlive
+from enact_dist.link.socket import feed as socket_feed
+from enact_dist.link.socket.line import SocketLine
 
 pytestmark = pytest.mark.carrier("auto")  # both are used at once
 

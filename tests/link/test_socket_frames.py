@@ -9,7 +9,7 @@ import threading
 import pytest
 
 from enact_dist.errors import ProtocolError
-from enact_dist.link.socket_frames import (
+from enact_dist.link.socket.frames import (
     BUFFER_BYTES,
     PREFIX_BYTES,
     STREAM_VERSION,

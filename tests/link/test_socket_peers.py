@@ -10,8 +10,8 @@ from socket_parts import COUNT, CUP, add_one, counters
 
 from enact_dist import Entity, Lock, Write, connect
 from enact_dist.errors import LinkError
-from enact_dist.link import socket_peers
-from enact_dist.link.socket_peers import Deaths, check_peer, peer_of
+from enact_dist.link.socket import peers as socket_peers
+from enact_dist.link.socket.peers import Deaths, check_peer, peer_of
 
 pytestmark = pytest.mark.carrier("socket")
 

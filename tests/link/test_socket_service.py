@@ -11,9 +11,8 @@ from types import SimpleNamespace
 import pytest
 from socket_parts import ask, counters, over_socket, speak
 
-from enact_dist.core import tenures
-from enact_dist.core.datum import Slot
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.datum import Slot
+from enact_dist.core.protocol.messages import (
     AwaitStamp,
     Committed,
     Granted,
@@ -25,9 +24,12 @@ from enact_dist.core.messages import (
     Refused,
     Survey,
 )
-from enact_dist.link import socket_connection, socket_service, socket_watcher
+from enact_dist.core.state import grants as tenures
 from enact_dist.link.notices import Interest
-from enact_dist.link.socket_frames import Kind, Stream, greeting_of, read_skipped, send_frame
+from enact_dist.link.socket import connection as socket_connection
+from enact_dist.link.socket import service as socket_service
+from enact_dist.link.socket import watcher as socket_watcher
+from enact_dist.link.socket.frames import Kind, Stream, greeting_of, read_skipped, send_frame
 from enact_dist.terms import Access
 from enact_dist.wire.frames import decode_frame, encode_frame
 
@@ -36,7 +38,7 @@ ANSWER_S = 30.0
 
 OPENS = """
 import socket, sys
-from enact_dist.link.socket_frames import Kind, Stream, greeting_of, send_frame
+from enact_dist.link.socket.frames import Kind, Stream, greeting_of, send_frame
 near = socket.socket(socket.AF_UNIX)
 near.connect(sys.argv[1])
 send_frame(near, greeting_of(sys.argv[2], "tester"), kind=Kind.OPEN)
@@ -488,8 +490,8 @@ def test_watcher_that_says_nonsense_is_refused(raw):
 
 def _write(peer, writer, stream, number):
     granted = peer.acquire("cup")
-    from enact_dist.core.datum import Datum, Slot
-    from enact_dist.core.messages import Commit, WriteItem
+    from enact_dist.core.protocol.datum import Datum, Slot
+    from enact_dist.core.protocol.messages import Commit, WriteItem
 
     datum = Datum(b"\x01", b"%d" % number, len(b"%d" % number))
     item = WriteItem(Slot("online", "cup", "count"), datum)

@@ -6,13 +6,13 @@ from types import SimpleNamespace
 
 import pytest
 
-from enact_dist.core.datum import Datum, Slot
-from enact_dist.core.messages import EpochChanged, Refused, Stage, Staged, WriteItem
+from enact_dist.core.protocol.datum import Datum, Slot
+from enact_dist.core.protocol.messages import EpochChanged, Refused, Stage, Staged, WriteItem
 from enact_dist.errors import EnactError, LeaseLostError, NoRoomError, ShardUnreachableError
-from enact_dist.link import staging
-from enact_dist.link.payload_desk import GAPS_MAX, PayloadDesk
-from enact_dist.link.session_client import FIRST_STAGED
-from enact_dist.link.staging import stage
+from enact_dist.link.client import transfer
+from enact_dist.link.client.transfer import stage
+from enact_dist.link.memory.names import FIRST_STAGED
+from enact_dist.link.memory.payload_desk import GAPS_MAX, PayloadDesk
 
 SLICE = 10_000
 SESSION = "0123abcd"
@@ -72,7 +72,7 @@ def without_body(write):
 @pytest.fixture(autouse=True)
 def little(monkeypatch):
     """Everything from 64 KiB on travels ahead."""
-    monkeypatch.setattr(staging, "INLINE_BYTES_MAX", 64 << 10)
+    monkeypatch.setattr(transfer, "INLINE_BYTES_MAX", 64 << 10)
 
 
 def write_of(name, size, seed=1):

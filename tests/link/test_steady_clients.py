@@ -12,8 +12,8 @@ import pytest
 
 from enact_dist import Aspect, Durability, Entity, Lock, View, Write, connect, local
 from enact_dist.errors import StoreError
-from enact_dist.link.dropped import when_dropped
-from enact_dist.link.pauses import Pauses
+from enact_dist.link.client.dropped import when_dropped
+from enact_dist.link.client.pauses import Pauses
 
 CYCLES = 50
 ROUNDS = 3

@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 
 from enact_dist import Aspect, Durability, Entity, Lock, View, Write, connect
-from enact_dist.core import history, tenures
-from enact_dist.core.beliefs import SENDINGS_KEPT
-from enact_dist.link.memory import leftovers
-from enact_dist.link.shard_daemon import DaemonSettings, start_shard
+from enact_dist.core.client.lease_clock import SENDINGS_KEPT
+from enact_dist.core.state import grants as tenures
+from enact_dist.core.state import history
+from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
+from enact_dist.link.memory.maps import leftovers
 
 CLOUD = Aspect("cloud", np.ndarray, Durability.VOLATILE, retention=1)
 NUMBER = Aspect("number", int, Durability.VOLATILE, retention=1)

@@ -9,9 +9,9 @@ import sys
 import pytest
 from store_writer import contents, outcome_record, persist, reopened, slot_record
 
-from enact_dist.core.datum import Datum, Slot
-from enact_dist.core.messages import AspectEntry
-from enact_dist.core.records import (
+from enact_dist.core.protocol.datum import Datum, Slot
+from enact_dist.core.protocol.messages import AspectEntry
+from enact_dist.core.protocol.records import (
     AspectRecord,
     AuditRecord,
     Recovered,
@@ -21,11 +21,11 @@ from enact_dist.core.records import (
     WorldRecord,
 )
 from enact_dist.errors import StoreError
-from enact_dist.link.folder_lock import FORMAT, FORMAT_READ_MIN
-from enact_dist.link.store import open_store
-from enact_dist.link.store_fields import pack
-from enact_dist.link.store_outcomes import OUTCOMES_KEPT_NS
-from enact_dist.link.store_rows import Key, Kind, row_checksum
+from enact_dist.link.folder.lock import FORMAT, FORMAT_READ_MIN
+from enact_dist.link.store.fields import pack
+from enact_dist.link.store.rows import Key, Kind, row_checksum
+from enact_dist.link.store.states import OUTCOMES_KEPT_NS
+from enact_dist.link.store.store import open_store
 from enact_dist.terms import Durability, NullReason
 
 SLOT = Slot("online", "tray/package/1", "surface")
@@ -45,7 +45,7 @@ def test_epoch_grows_with_every_opening(tmp_path):
 def test_epoch_is_used_up_by_an_opening_that_is_killed(tmp_path):
     """A process that opened the store and died at once has used its epoch."""
     script = (
-        "import os, sys; from pathlib import Path; from enact_dist.link.store import open_store\n"
+        "import os, sys; from pathlib import Path; from enact_dist.link.store.store import open_store\n"
         f"s, r = open_store(Path({str(tmp_path)!r}), unix_s=100); print(r.epoch, flush=True)\n"
         "os.kill(os.getpid(), 9)"
     )
@@ -237,7 +237,7 @@ def test_second_opener_is_refused_by_pid_and_host(tmp_path):
     """A folder serves one process: the second one is told folder, pid and host of the first."""
     store, _ = open_store(tmp_path, unix_s=1)
     script = (
-        "from pathlib import Path; from enact_dist.link.store import open_store\n"
+        "from pathlib import Path; from enact_dist.link.store.store import open_store\n"
         f"open_store(Path({str(tmp_path)!r}), unix_s=1)"
     )
     ended = subprocess.run(

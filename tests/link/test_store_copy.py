@@ -15,13 +15,14 @@ from store_writer import LARGE_BYTES as LARGE
 from store_writer import fill, persist, slot_record, versions
 
 from enact_dist.errors import StoreError
-from enact_dist.link import held_bodies as held_bodies_module
-from enact_dist.link import private_copy, store_copy
-from enact_dist.link.backup_digests import BACKUP_FILE, read_sealed, sealed
-from enact_dist.link.folder_lock import FolderLock
-from enact_dist.link.held_bodies import HELD_FOLDER, held_bodies
-from enact_dist.link.store import open_store
-from enact_dist.link.store_copy import back_up, restore
+from enact_dist.link.folder import held_bodies as held_bodies_module
+from enact_dist.link.folder.held_bodies import HELD_FOLDER, held_bodies
+from enact_dist.link.folder.lock import FolderLock
+from enact_dist.link.offline import backup as store_copy
+from enact_dist.link.offline import backup_files
+from enact_dist.link.offline.backup import back_up, restore
+from enact_dist.link.offline.backup_files import BACKUP_FILE, read_sealed, sealed
+from enact_dist.link.store.store import open_store
 from enact_dist.terms import Durability
 
 NAMES = {"cell": "line", "shard": "left"}
@@ -244,7 +245,7 @@ def test_a_backup_is_made_where_no_folder_can_be_locked(folder, tmp_path, monkey
         raise OSError(errno.EBADF, "Bad file descriptor")
 
     (tmp_path / "copy.partial" / "blobs").mkdir(parents=True)
-    monkeypatch.setattr(private_copy, "fcntl", SimpleNamespace(flock=refuse, LOCK_EX=2, LOCK_NB=4))
+    monkeypatch.setattr(backup_files, "fcntl", SimpleNamespace(flock=refuse, LOCK_EX=2, LOCK_NB=4))
     back_up(folder, tmp_path / "copy", unix_s=1, **NAMES)
     restore(tmp_path / "copy", tmp_path / "new", unix_s=1, **NAMES)
     assert versions(tmp_path / "new") == {"a": 1, "b": 1}

@@ -16,13 +16,13 @@ import pytest
 import store_writer
 from store_writer import contents, group_versions, outcome_record, persist, reopened, slot_record
 
-from enact_dist.core.datum import Slot
-from enact_dist.core.records import SessionRecord, SlotRecord
+from enact_dist.core.protocol.datum import Slot
+from enact_dist.core.protocol.records import SessionRecord, SlotRecord
 from enact_dist.errors import StoreError
-from enact_dist.link.folder_lock import FORMAT
-from enact_dist.link.store import open_store
-from enact_dist.link.store_database import Database
-from enact_dist.link.store_mark import MarkFile
+from enact_dist.link.folder.lock import FORMAT
+from enact_dist.link.folder.mark import MarkFile
+from enact_dist.link.store.database import Database
+from enact_dist.link.store.store import open_store
 from enact_dist.terms import Durability
 
 FORMAT_LINE = f"enact-dist store {FORMAT}\n".encode()

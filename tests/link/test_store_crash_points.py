@@ -31,11 +31,11 @@ from store_model import State
 from store_workload import ASPECTS, SETTINGS
 
 import enact_dist
-from enact_dist.core.datum import Slot
-from enact_dist.core.shard import Shard
+from enact_dist.core.protocol.datum import Slot
+from enact_dist.core.shard.shard import Shard
 from enact_dist.errors import StoreError
-from enact_dist.link import store_mark
-from enact_dist.link.store import open_store
+from enact_dist.link.folder import mark as store_mark
+from enact_dist.link.store.store import open_store
 
 pytestmark = [
     pytest.mark.slow,

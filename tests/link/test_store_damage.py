@@ -9,15 +9,15 @@ from pathlib import Path
 import pytest
 from store_writer import contents, outcome_record, persist, reopened, slot_record
 
-from enact_dist.core.datum import Slot
-from enact_dist.core.records import SlotRecord
+from enact_dist.core.protocol.datum import Slot
+from enact_dist.core.protocol.records import SlotRecord
 from enact_dist.errors import StoreError
-from enact_dist.link import store as store_module
-from enact_dist.link import store_mark
-from enact_dist.link.store import open_store, read_store
-from enact_dist.link.store_folder import DATABASE_FILE
-from enact_dist.link.store_mark import MARK_FILE
-from enact_dist.link.wal_check import check_wal, commit_ends
+from enact_dist.link.folder import mark as store_mark
+from enact_dist.link.folder.folder import DATABASE_FILE
+from enact_dist.link.folder.mark import MARK_FILE
+from enact_dist.link.folder.wal_check import check_wal, commit_ends
+from enact_dist.link.store import store as store_module
+from enact_dist.link.store.store import open_store, read_store
 from enact_dist.terms import Durability, NullReason
 
 FRAME_BYTES = 24 + 4096

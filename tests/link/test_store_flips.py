@@ -21,9 +21,9 @@ from store_disk import memory_folder
 from store_model import State
 from store_writer import outcome_record, persist, slot_record
 
-from enact_dist.core.datum import Datum, LockId, Position, Slot, Token
-from enact_dist.core.messages import Cause, DatumRead, Item, SlotVersion, WriteItem
-from enact_dist.core.records import (
+from enact_dist.core.protocol.datum import Datum, LockId, Position, Slot, Token
+from enact_dist.core.protocol.messages import Cause, DatumRead, Item, SlotVersion, WriteItem
+from enact_dist.core.protocol.records import (
     DecisionRecord,
     KeptRecord,
     PreparedRecord,
@@ -32,8 +32,8 @@ from enact_dist.core.records import (
     WorldRecord,
 )
 from enact_dist.errors import StoreError
-from enact_dist.link.blobs import Blob, BlobFolder, DamagedBlobError
-from enact_dist.link.store import open_store
+from enact_dist.link.folder.blobs import Blob, BlobFolder, DamagedBlobError
+from enact_dist.link.store.store import open_store
 from enact_dist.terms import Durability
 
 pytestmark = pytest.mark.slow

@@ -5,9 +5,16 @@ from dataclasses import replace
 import pytest
 from store_writer import persist, slot_record
 
-from enact_dist.core.datum import LockId, Slot, Token
-from enact_dist.core.messages import AspectEntry, Cause, DatumRead, Item, SlotVersion, WriteItem
-from enact_dist.core.records import (
+from enact_dist.core.protocol.datum import LockId, Slot, Token
+from enact_dist.core.protocol.messages import (
+    AspectEntry,
+    Cause,
+    DatumRead,
+    Item,
+    SlotVersion,
+    WriteItem,
+)
+from enact_dist.core.protocol.records import (
     AspectRecord,
     HistoryForgotten,
     KeptRecord,
@@ -18,8 +25,8 @@ from enact_dist.core.records import (
     WorldRecord,
 )
 from enact_dist.errors import StoreError
-from enact_dist.link import store_mark
-from enact_dist.link.store import open_store
+from enact_dist.link.folder import mark as store_mark
+from enact_dist.link.store.store import open_store
 from enact_dist.terms import Durability, NullReason
 
 SLOT = slot_record("a", 1).slot
@@ -282,7 +289,7 @@ def test_durable_fork_of_an_os_version_forces_its_file(folder, monkeypatch):
     """Nothing is copied, and a power cut must not take it from then on, from the source neither."""
     folder.write(state(1, size=LARGE), durability=Durability.OS)
     forced = []
-    monkeypatch.setattr("enact_dist.link.blobs.os.fdatasync", forced.append)
+    monkeypatch.setattr("enact_dist.link.folder.blobs.os.fdatasync", forced.append)
     folder.write(forked(1, 1), forked(2, 1))
     assert len(forced) == 1
     (name,) = folder.files

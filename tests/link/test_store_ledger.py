@@ -10,9 +10,16 @@ from hypothesis import strategies as st
 from store_disk import memory_folder
 from store_model import State
 
-from enact_dist.core.datum import Datum, LockId, Position, Slot, Token
-from enact_dist.core.messages import AspectEntry, Cause, DatumRead, Item, SlotVersion, WriteItem
-from enact_dist.core.records import (
+from enact_dist.core.protocol.datum import Datum, LockId, Position, Slot, Token
+from enact_dist.core.protocol.messages import (
+    AspectEntry,
+    Cause,
+    DatumRead,
+    Item,
+    SlotVersion,
+    WriteItem,
+)
+from enact_dist.core.protocol.records import (
     AspectForgotten,
     AspectRecord,
     AuditRecord,
@@ -34,7 +41,7 @@ from enact_dist.core.records import (
     WorldDropped,
     WorldRecord,
 )
-from enact_dist.link.store import open_store
+from enact_dist.link.store.store import open_store
 from enact_dist.terms import Durability
 
 CONTEXTS = ("online", "what_if")

@@ -2,9 +2,9 @@
 
 import tracemalloc
 
-from enact_dist.core.datum import LockId
-from enact_dist.link.store_outcomes import OUTCOMES_KEPT_NS, Outcomes
-from enact_dist.link.store_rows import Kind, key_of, outcome_key
+from enact_dist.core.protocol.datum import LockId
+from enact_dist.link.store.rows import Kind, key_of, outcome_key
+from enact_dist.link.store.states import OUTCOMES_KEPT_NS, Outcomes
 
 DAY_NS = OUTCOMES_KEPT_NS
 

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from enact_dist.core.datum import Datum, LockId, Position, Slot, Token
-from enact_dist.core.messages import Item, SlotVersion, WriteItem
-from enact_dist.core.records import (
+from enact_dist.core.protocol.datum import Datum, LockId, Position, Slot, Token
+from enact_dist.core.protocol.messages import Item, SlotVersion, WriteItem
+from enact_dist.core.protocol.records import (
     AuditRecord,
     DecisionDone,
     DecisionRecord,
@@ -18,8 +18,8 @@ from enact_dist.core.records import (
     SlotRecord,
 )
 from enact_dist.errors import StoreError
-from enact_dist.link.store import open_store
-from enact_dist.link.store_prepared import prepared_key
+from enact_dist.link.store.prepared import prepared_key
+from enact_dist.link.store.store import open_store
 from enact_dist.terms import Durability
 
 LOCK = LockId("ann", 3, 4)
@@ -157,7 +157,7 @@ def test_body_that_was_not_forced_is_forced_for_a_durable_end(tmp_path, monkeypa
     store.write([Persist(1, (record,), Durability.OS)])
     promised, forced = blobs(tmp_path), []
     monkeypatch.setattr(
-        "enact_dist.link.blobs.os.fdatasync",
+        "enact_dist.link.folder.blobs.os.fdatasync",
         lambda descriptor: forced.append(Path(f"/proc/self/fd/{descriptor}").readlink()),
     )
     slot = SlotRecord(LARGE, 10, 80, record.writes[1].datum, "")
@@ -182,7 +182,7 @@ def test_missing_data_of_a_prepared_lock_are_refused(tmp_path):
 def test_row_of_a_prepared_lock_that_cannot_be_read_is_refused_by_name(tmp_path, monkeypatch, body):
     """As any other damaged row, though it is read last: a `StoreError`, not msgpack's own."""
     monkeypatch.setattr(
-        "enact_dist.link.store_batch.prepared_row", lambda record: (prepared_key(record.lock), body)
+        "enact_dist.link.store.batch.prepared_row", lambda record: (prepared_key(record.lock), body)
     )
     with pytest.raises(StoreError, match=r"the prepared lock ann\.3\.4 cannot be read"):
         kept(tmp_path, prepared())

@@ -6,8 +6,8 @@ import pytest
 from store_writer import outcome_record, persist, reopened, slot_record
 
 from enact_dist.errors import StoreError
-from enact_dist.link.store import open_store
-from enact_dist.link.store_thread import REPORTED_MAX, StoreThread
+from enact_dist.link.store.store import open_store
+from enact_dist.link.store.thread import REPORTED_MAX, StoreThread
 
 WAIT_S = 20.0
 

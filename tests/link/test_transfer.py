@@ -7,16 +7,15 @@ from types import SimpleNamespace
 
 import pytest
 
-from enact_dist.core.datum import Datum, LockId, Slot
-from enact_dist.core.lock_parts import Reading
-from enact_dist.core.messages import EpochChanged, Gone, Refused, Slice, SlotState
+from enact_dist.core.client.plan import Reading
+from enact_dist.core.protocol.datum import Datum, LockId, Slot
+from enact_dist.core.protocol.messages import EpochChanged, Gone, Refused, Slice, SlotState
 from enact_dist.errors import EnactError, LeaseLostError, ProtocolError, ShardUnreachableError
-from enact_dist.link import transfer
-from enact_dist.link.datum_cache import DatumCache
-from enact_dist.link.fetching import fetch_all
-from enact_dist.link.socket_carrier import _Begun
-from enact_dist.link.socket_line import Connection, SocketLine
-from enact_dist.link.transfer import Piece, Transfer
+from enact_dist.link.client import transfer
+from enact_dist.link.client.fetch import DatumCache, fetch_all
+from enact_dist.link.client.transfer import Piece, Transfer
+from enact_dist.link.socket.carrier import _Begun
+from enact_dist.link.socket.line import Connection, SocketLine
 
 LOCK = LockId("session", 0, 1)
 SLICE = 1000

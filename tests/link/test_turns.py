@@ -2,8 +2,8 @@
 
 import pytest
 
-from enact_dist.link import turns as module
-from enact_dist.link.turns import Turns
+from enact_dist.link.zenoh import turns as module
+from enact_dist.link.zenoh.turns import Turns
 
 
 def filled(*sent):

@@ -6,7 +6,7 @@ import sys
 from hypothesis import given
 from hypothesis import strategies as st
 
-from enact_dist.link.used_names import NUMBERS_MAX, SERIES_MAX, UsedNames
+from enact_dist.link.memory.names import NUMBERS_MAX, SERIES_MAX, UsedNames
 
 NAMES = st.builds("{}-{:x}".format, st.sampled_from(["ann", "bob"]), st.integers(0, 2**64 - 1))
 

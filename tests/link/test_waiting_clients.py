@@ -32,7 +32,7 @@ def test_client_of_a_stopped_shard_sleeps_and_is_answered_when_it_goes_on(
     process, endpoint, until, monkeypatch, carrier
 ):
     """It makes few calls, wakes few threads, and wakes by itself once the shard is back."""
-    monkeypatch.setattr("enact_dist.link.socket_line.CONNECT_S", 0.5)  # as in the product
+    monkeypatch.setattr("enact_dist.link.socket.line.CONNECT_S", 0.5)  # as in the product
     shard = process(endpoint)
     with connect(endpoint, timeout_s=30.0) as cell:
         write = Write(cell.world("online"), Entity("part"), Aspect("number", int))

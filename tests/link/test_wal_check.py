@@ -7,7 +7,7 @@ import struct
 
 import pytest
 
-from enact_dist.link.wal_check import FRAME_HEADER_BYTES, HEADER_BYTES, WalVerdict, check_wal
+from enact_dist.link.folder.wal_check import FRAME_HEADER_BYTES, HEADER_BYTES, WalVerdict, check_wal
 
 
 def make_log(path, *, page_bytes=4096, commits=12, generations=1):

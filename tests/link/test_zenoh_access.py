@@ -8,11 +8,11 @@ import socket
 import pytest
 import zenoh
 
-from enact_dist.core import messages as m
-from enact_dist.link.endpoints import split_endpoint
-from enact_dist.link.zenoh_access import ACCEPT_PENDING, listening_settings
-from enact_dist.link.zenoh_config import close_session, open_session, session_config
-from enact_dist.link.zenoh_discovery import find_shards
+from enact_dist.core.protocol import messages as m
+from enact_dist.link.zenoh.access import ACCEPT_PENDING, listening_settings
+from enact_dist.link.zenoh.config import close_session, open_session, session_config
+from enact_dist.link.zenoh.discovery import find_shards
+from enact_dist.link.zenoh.endpoints import split_endpoint
 from enact_dist.wire.frames import decode_frame, encode_frame
 from enact_dist.wire.keys import notice_key, queryable_key, token_key
 

@@ -8,7 +8,7 @@ import time
 import pytest
 from parked_parts import parked
 
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.messages import (
     Committed,
     Fetch,
     ListLocks,
@@ -25,8 +25,10 @@ from enact_dist.errors import (
     ProtocolError,
     ShardUnreachableError,
 )
-from enact_dist.link import zenoh_bulk, zenoh_carrier, zenoh_config
-from enact_dist.link.zenoh_config import close_session, open_session
+from enact_dist.link.zenoh import bulk as zenoh_bulk
+from enact_dist.link.zenoh import carrier as zenoh_carrier
+from enact_dist.link.zenoh import config as zenoh_config
+from enact_dist.link.zenoh.config import close_session, open_session
 from enact_dist.wire.frames import encode_frame
 
 both = pytest.mark.parametrize("carry", ["zenoh", "socket"], indirect=True)

@@ -2,9 +2,9 @@
 
 import pytest
 
-from enact_dist.core.messages import Hello, ShardEntry, Welcome
+from enact_dist.core.protocol.messages import Hello, ShardEntry, Welcome
 from enact_dist.errors import ShardUnreachableError
-from enact_dist.link.zenoh_discovery import FoundShard, discover, find_shards
+from enact_dist.link.zenoh.discovery import FoundShard, discover, find_shards
 
 
 def test_discovery_learns_cell_and_shard_from_one_endpoint(daemon, endpoint):

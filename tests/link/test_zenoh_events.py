@@ -9,9 +9,9 @@ from types import SimpleNamespace
 import pytest
 import zenoh
 
-from enact_dist.link.zenoh_config import close_session, open_session
-from enact_dist.link.zenoh_events import Events
-from enact_dist.link.zenoh_presence import ShardPresence
+from enact_dist.link.zenoh.config import close_session, open_session
+from enact_dist.link.zenoh.events import Events
+from enact_dist.link.zenoh.presence import ShardPresence
 
 QUIET_S = 1.0
 """A thread that waits in a channel of Zenoh's wakes ten times in this."""

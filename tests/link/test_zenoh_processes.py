@@ -2,12 +2,12 @@
 
 import pytest
 
-from enact_dist.core.messages import ListSessions
+from enact_dist.core.protocol.messages import ListSessions
 
 LEFT_OPEN = """
 import sys, threading
-from enact_dist.core.messages import AwaitStamp, Hello
-from enact_dist.link.zenoh_carrier import ZenohCarrier
+from enact_dist.core.protocol.messages import AwaitStamp, Hello
+from enact_dist.link.zenoh.carrier import ZenohCarrier
 carrier = ZenohCarrier("cell", "left-open", "tester", [sys.argv[1]], ttl_s=2.0)
 feed = carrier.subscribe()
 hello = Hello("left-open", 0, 2_000_000_000, "tester", "host", 1, True)
@@ -33,9 +33,9 @@ def test_carrier_left_open_never_holds_up_the_end_of_the_interpreter(daemon, end
 
 FORKED = """
 import os, sys
-from enact_dist.core.messages import ListLocks
+from enact_dist.core.protocol.messages import ListLocks
 from enact_dist.errors import MisuseError
-from enact_dist.link.zenoh_carrier import ZenohCarrier
+from enact_dist.link.zenoh.carrier import ZenohCarrier
 carrier = ZenohCarrier("cell", "parent", "tester", [sys.argv[1]], ttl_s=2.0)
 child = os.fork()
 if child == 0:
@@ -105,8 +105,8 @@ def test_connect_is_refused_in_a_forked_child_though_its_parent_has_closed(
 
 KILLED = """
 import sys
-from enact_dist.core.messages import Hello
-from enact_dist.link.zenoh_carrier import ZenohCarrier
+from enact_dist.core.protocol.messages import Hello
+from enact_dist.link.zenoh.carrier import ZenohCarrier
 carrier = ZenohCarrier("cell", "victim", "tester", [sys.argv[1]], ttl_s=240.0)
 carrier.request("s0", Hello("victim", 0, 240_000_000_000, "victim", "h", 1, False), timeout_s=30)
 print("open", flush=True)

@@ -15,11 +15,11 @@ from types import SimpleNamespace
 import pytest
 import zenoh
 
-from enact_dist.link import zenoh_config, zenoh_links
-from enact_dist.link.zenoh_carrier import wait_connected
-from enact_dist.link.zenoh_config import close_session, open_session
-from enact_dist.link.zenoh_links import _lost_after
-from enact_dist.link.zenoh_sockets import connections, give_up, settle, unanswered
+from enact_dist.link.zenoh import config as zenoh_config
+from enact_dist.link.zenoh import links as zenoh_links
+from enact_dist.link.zenoh.carrier import wait_connected
+from enact_dist.link.zenoh.config import close_session, open_session
+from enact_dist.link.zenoh.links import _lost_after, connections, give_up, settle, unanswered
 
 LINGER = struct.Struct("ii")
 ZENOHS = (1, 10)
@@ -116,7 +116,7 @@ READER = """
 import contextlib
 import sys
 import zenoh
-from enact_dist.link.zenoh_config import open_session
+from enact_dist.link.zenoh.config import open_session
 session = open_session(connect=[sys.argv[1]], lease_s=60.0)
 while True:  # until the queryable is known here, and then until the answer comes
     with contextlib.suppress(zenoh.ZError):
@@ -156,8 +156,8 @@ def send(query, data):
 
 LEFT_OPEN = """
 import sys
-from enact_dist.link import zenoh_links
-from enact_dist.link.zenoh_config import open_session
+from enact_dist.link.zenoh import links as zenoh_links
+from enact_dist.link.zenoh.config import open_session
 zenoh_links.JOIN_S = 3600.0
 kept = [open_session(listen=[endpoint], lease_s=1.0) for endpoint in sys.argv[1:]]
 """

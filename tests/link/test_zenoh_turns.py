@@ -6,11 +6,12 @@ from collections import Counter
 import pytest
 import zenoh
 
-from enact_dist.core.messages import Hello, ListLocks, Ping
-from enact_dist.link import turns, zenoh_service
+from enact_dist.core.protocol.messages import Hello, ListLocks, Ping
 from enact_dist.link.host import TICK_S_MAX
-from enact_dist.link.stalls import STALL_S
-from enact_dist.link.zenoh_config import close_session, open_session
+from enact_dist.link.host_guards import STALL_S
+from enact_dist.link.zenoh import service as zenoh_service
+from enact_dist.link.zenoh import turns
+from enact_dist.link.zenoh.config import close_session, open_session
 from enact_dist.wire.frames import encode_frame
 from enact_dist.wire.keys import request_key, verb_of
 

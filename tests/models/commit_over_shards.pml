@@ -1,19 +1,19 @@
 /* A commit over two shards: acquire, validate, prepare, decide, finish, resolve, presumed abort.
  *
  * Each step names what it mirrors in enact_dist/core (file:function):
- *   lock_desk.py:on_acquire, tenures.py:grant_ready          grant
- *   shard.py:_expire, lock_desk.py:on_release,
- *   session_desk.py:on_keep_alive, tenures.py:take_away      a lock ends; only if it is not `bound`
- *   commits.py:_fence, commits.py:refusal                    FENCE
- *   commits.py:validate                                      validate
- *   prepares.py:on_prepare, persisted                        prepare, and its record on disk
- *   commits.py:commit, persisted, _apply, _recorded          the commit that decides
- *   decisions.py:decided, tell, finished                     telling the participant
- *   prepares.py:on_finish, _finish, persisted                finish, and its end on disk
- *   prepares.py:on_resolve, _resolved, on_called             resolve, presumed abort
- *   prepares.py:__init__, tenures.py:restore                 restart
- *   multilock.py:_on_acquiring, finish, _on_vote,
- *   _on_committing, _on_outcome, _gives_up, client.py:_epoch_changed    the client
+ *   shard/on_lock.py:on_acquire, state/grants.py:grant_ready   grant
+ *   shard/shard.py:_expire, shard/on_lock.py:on_release,
+ *   shard/on_session.py:on_keep_alive, state/grants.py:take_away   a lock ends; only if it is not `bound`
+ *   state/commits.py:_fence, state/commits.py:refusal   FENCE
+ *   state/commits.py:validate   validate
+ *   shard/on_prepare.py:on_prepare, persisted   prepare, and its record on disk
+ *   state/commits.py:commit, persisted, _apply, _recorded   the commit that decides
+ *   state/decisions.py:decided, tell, finished   telling the participant
+ *   shard/on_prepare.py:on_finish, _finish, persisted   finish, and its end on disk
+ *   shard/on_prepare.py:on_resolve, _resolved, on_called   resolve, presumed abort
+ *   shard/on_prepare.py:__init__, state/grants.py:restore   restart
+ *   client/lock.py:_on_acquiring, finish, _on_vote,
+ *   _on_committing, _on_outcome, _gives_up, client/session.py:_epoch_changed   the client
  *
  * Network: what was sent stays deliverable for ever, so it may be late, doubled or overtaken; what
  * is lost is never delivered.  An answer that stays true once it is true (committed, fenced for

@@ -1,16 +1,16 @@
 /* Views over two shards as one cut, beside commits over both shards, without synchronised clocks.
  *
  * Each step names what it mirrors in enact_dist/core (file:function):
- *   stamps.py:next, saw, now, shard_state.py:stamp       a shard's clock of stamps
- *   prepares.py:on_prepare, _finish, persisted, undecided    prepare, finish at B
- *   commits.py:commit, persisted, undecided              the commit that decides, at A
- *   finishing.py:commit                                  its stamp comes after the prepared ones
- *   view_desk.py:on_take_view, _undecided_ns, _viewed    view, and until when it is current
- *   slots.py:shown, at, slot_history.py:at               the state as of a stamp, if not forgotten
- *   cuts.py:take, settled                                the cut
- *   shard.py:__init__, sessions.py:in_grace              restart; the grace waits for a viewer that
+ *   state/clock.py:next, saw, now, shard/state.py:stamp   a shard's clock of stamps
+ *   shard/on_prepare.py:on_prepare, _finish, persisted, undecided   prepare, finish at B
+ *   state/commits.py:commit, persisted, undecided   the commit that decides, at A
+ *   client/finishing.py:commit   its stamp comes after the prepared ones
+ *   shard/on_view.py:on_take_view, _undecided_ns, _viewed   view, and until when it is current
+ *   state/slots.py:shown, at, state/slot_history.py:at   the state as of a stamp, if not forgotten
+ *   client/cut.py:take, settled   the cut
+ *   shard/shard.py:__init__, state/sessions.py:in_grace   restart; the grace waits for a viewer that
  *                                                        locks, not for an observer
- *   beliefs.py:believe_until_ns, multilock.py:_on_viewed     for how long an answer counts
+ *   client/lease_clock.py:believe_until_ns, client/lock.py:_on_viewed   for how long an answer counts
  *
  * Every commit writes both shards, so a cut is whole if both show the same commit.  A view that
  * waits for what is undecided may be answered without waiting here: it is so after 0.4 s too.

@@ -1,11 +1,11 @@
 /* Two locks that each expect a view of what the other writes: one of them must fail.
  *
  * Each step names what it mirrors in enact_dist/core (file:function):
- *   commits.py:moved_on, _in_the_way, _newest_version    still_stands
- *   commits.py:validate, _expected                       an expectation where nothing is held
- *   commits.py:commit, persisted, _apply                 a commit that expects something itself
- *   multilock.py:_acquire (`alone`), finish, _after_votes    the client
- *   tenures.py:take_away, shard.py:_expire               the end of a lease
+ *   state/commits.py:moved_on, _in_the_way, _newest_version   still_stands
+ *   state/commits.py:validate, _expected   an expectation where nothing is held
+ *   state/commits.py:commit, persisted, _apply   a commit that expects something itself
+ *   client/lock.py:_acquire (`alone`), finish, _after_votes   the client
+ *   state/grants.py:take_away, shard/shard.py:_expire   the end of a lease
  *
  * Lock 0 writes slot 0 and expects slot 1 as it viewed it, lock 1 the other way round.  On two
  * shards each validates its expectation at the other's shard before it commits at its own; with

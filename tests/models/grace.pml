@@ -1,17 +1,17 @@
 /* A restarted shard, its grace, and who may still believe in a grant of an earlier epoch.
  *
  * Each step names what it mirrors in enact_dist/core (file:function):
- *   session_desk.py:on_hello, persisted, sessions.py:hello       hello, durable before it is welcome
- *   session_desk.py:on_goodbye, end, shard.py:_on_tick (idle)    the end of a session
- *   session_desk.py:on_keep_alive, client.py:_alive              keep-alive
- *   sessions.py:__init__, in_grace, end_grace_if_all_acknowledged    the grace and its two ends
- *   tenures.py:grant_ready, shard_state.py:grant_ready           grant
- *   shard.py:_expire, sessions.py:lease_end_ns                   lease
- *   client.py:hello, _welcomed, _epoch_changed, _drop_grants     what a client knows
- *   multilock.py:_on_acquiring, valid, beliefs.py                belief
+ *   shard/on_session.py:on_hello, persisted, state/sessions.py:hello   hello, durable before it is welcome
+ *   shard/on_session.py:on_goodbye, end, shard/shard.py:_on_tick (idle)   the end of a session
+ *   shard/on_session.py:on_keep_alive, client/session.py:_alive   keep-alive
+ *   state/sessions.py:__init__, in_grace, end_grace_if_all_acknowledged   the grace and its two ends
+ *   state/grants.py:grant_ready, shard/state.py:grant_ready   grant
+ *   shard/shard.py:_expire, state/sessions.py:lease_end_ns   lease
+ *   client/session.py:hello, _welcomed, _epoch_changed, _drop_grants   what a client knows
+ *   client/lock.py:_on_acquiring, valid, client/lease_clock.py   belief
  *
  * Network: requests and Welcomes stay deliverable for ever; a grant can be taken until its belief
- * would be over (belief counts from the sending of the request, see beliefs.py).
+ * would be over (belief counts from the sending of the request, see client/lease_clock.py).
  * Time: `window` of a client is open while anything that it was granted may still be believed in.
  * It closes at any moment.  The clocks' bounded drift (2 %) gives one rule: a shard's lease, and
  * the full length of a grace, end only after the windows that they stand for have closed.

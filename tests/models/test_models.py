@@ -11,7 +11,7 @@ import pytest
 from spin_models import BREAKS, HERE, HOLDS, MODELS, REACHES, VARIANTS, SpinError, _read, verify
 
 CORE = Path(__file__).parents[2] / "enact_dist" / "core"
-MIRRORED = re.compile(r"(\w+\.py):(\w+(?:, \w+(?![\w.]))*)")
+MIRRORED = re.compile(r"([\w/]+\.py):(\w+(?:, \w+(?![\w./]))*)")
 LAST_LINES = "State-vector 8 byte, depth reached 9, errors: 1\n 7 states, stored\n"
 
 

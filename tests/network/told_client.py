@@ -20,9 +20,9 @@ import time
 from pathlib import Path
 
 from enact_dist import Entity, View, Write, connect
-from enact_dist.core.messages import Commit
+from enact_dist.core.protocol.messages import Commit
 from enact_dist.errors import LinkError, LockTimeoutError
-from enact_dist.link import client as link_client
+from enact_dist.link.client import locks as link_client
 from enact_dist.link.clock import boottime_ns
 from enact_dist.verify.chaos.journal import Journal
 from enact_dist.verify.chaos.workload import ASPECTS, Plan, Workload, datum_text

@@ -7,9 +7,9 @@ import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as nps
 
-from enact_dist.config_shows import GUESSED
-from enact_dist.core.datum import Datum, Slot
-from enact_dist.core.messages import AspectEntry
+from enact_dist.config.shows import GUESSED
+from enact_dist.core.protocol.datum import Datum, Slot
+from enact_dist.core.protocol.messages import AspectEntry
 from enact_dist.recording.exact import Recorded
 from enact_dist.recording.file import RecordingFile
 from enact_dist.wire.payload import encode_datum

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from recording_samples import data, recorded, same
 
-from enact_dist.core.datum import Slot
+from enact_dist.core.protocol.datum import Slot
 from enact_dist.errors import ProtocolError
 from enact_dist.recording.exact import Recorded, decode_recorded, encode_recorded
 

@@ -14,7 +14,7 @@ from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 from recording_samples import BEGIN_NS, datum, file, recorded
 
-from enact_dist.core.datum import Slot
+from enact_dist.core.protocol.datum import Slot
 from enact_dist.errors import ConfigError, ProtocolError
 from enact_dist.recording import Replay
 from enact_dist.recording.exact import encode_recorded

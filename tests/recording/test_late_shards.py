@@ -7,10 +7,10 @@ import pytest
 from ports import free_endpoint
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
-from enact_dist.core.message_parts import Pin, PlacementMap, ShardEntry
-from enact_dist.core.messages import Finish
-from enact_dist.core.shard_state import ShardSettings
-from enact_dist.link.shard_daemon import DaemonSettings, start_shard
+from enact_dist.core.protocol.messages import Finish
+from enact_dist.core.protocol.parts import Pin, PlacementMap, ShardEntry
+from enact_dist.core.shard.state import ShardSettings
+from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
 from enact_dist.recording import Recorder, recorder, settling
 from enact_dist.recording.reading import Recording
 

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from recording_samples import BEGIN_NS, Cloud, Mesh, data, datum, recorded
 
-from enact_dist.config_shows import GUESSED, KINDS, Shows
-from enact_dist.core.datum import Slot
+from enact_dist.config.shows import GUESSED, KINDS, Shows
+from enact_dist.core.protocol.datum import Slot
 from enact_dist.errors import ConfigError
 from enact_dist.recording.exact import Recorded
 from enact_dist.recording.geometry import quaternion

@@ -11,14 +11,15 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from enact_dist import Aspect, Durability, Entity, Lock, Write, version_data
-from enact_dist.core import history
+from enact_dist import Aspect, Durability, Entity, Lock, Write
+from enact_dist.core.state import history
 from enact_dist.errors import ConfigError, StoreError, UnknownWorldError
 from enact_dist.link import notices
 from enact_dist.recording import Recorder, Replay, Shows, export_world, recorder
 from enact_dist.recording.exporting import world_as_of
 from enact_dist.recording.file import RecordingFile
 from enact_dist.recording.reading import Recording
+from enact_dist.world import version_data
 
 COUNT = Aspect("count", int)
 CLOUD = Aspect("cloud", np.ndarray, Durability.VOLATILE)
@@ -406,7 +407,7 @@ def test_versions_are_explained_in_parts_where_one_answer_is_too_short(cell, onl
     for number in range(9):
         put((request, number))
     versions = online.history(piece, COUNT)
-    monkeypatch.setattr("enact_dist.core.pages.PAGE_BYTES_MAX", 1_000)
+    monkeypatch.setattr("enact_dist.core.protocol.pages.PAGE_BYTES_MAX", 1_000)
     wanted = [
         version_data.Wanted(v.position.stamp_ns, v.slot, v.version, v.position.shard)
         for v in versions

@@ -7,7 +7,7 @@ import pytest
 from recording_samples import BEGIN_NS, counting, datum, file, recorded
 
 from enact_dist import Aspect, Entity, View
-from enact_dist.core.datum import Slot
+from enact_dist.core.protocol.datum import Slot
 from enact_dist.errors import ConfigError, DatumTypeError, MisuseError
 from enact_dist.recording import Replay
 from enact_dist.recording.exporting import world_as_of

@@ -6,8 +6,8 @@ import pytest
 from recording_samples import BEGIN_NS, counting, file, recorded
 
 from enact_dist import Actor, Aspect, Entities, Entity, Lock, World, Write
-from enact_dist.actor_report import ActorStatistics, encode_reports
-from enact_dist.core.datum import Slot
+from enact_dist.actor.report import ActorStatistics, encode_reports
+from enact_dist.core.protocol.datum import Slot
 from enact_dist.errors import ConfigError, MisuseError
 from enact_dist.recording import Replay
 
@@ -156,7 +156,7 @@ def test_an_actor_that_writes_something_else_is_not_named(cell, pieces, options)
 
 def test_running_actors_say_what_they_write(cell):
     """With their roles bound, as narrow as the one entity that they work on."""
-    from enact_dist.actor_runner import ActorRun
+    from enact_dist.actor.running.runner import ActorRun
 
     run = ActorRun(Weighing(), cell, {"online": "training"}, stop=threading.Event())
 

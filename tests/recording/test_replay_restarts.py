@@ -5,10 +5,10 @@ from ports import free_endpoint
 from recording_samples import counting
 
 from enact_dist import Aspect, Entity, View, connect
-from enact_dist.core.message_parts import PlacementMap, ShardEntry
-from enact_dist.core.shard_state import ShardSettings
+from enact_dist.core.protocol.parts import PlacementMap, ShardEntry
+from enact_dist.core.shard.state import ShardSettings
 from enact_dist.errors import DatumTypeError
-from enact_dist.link.shard_daemon import DaemonSettings, start_shard
+from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
 from enact_dist.recording import Replay
 
 piece, other = Entity("piece"), Entity("other")

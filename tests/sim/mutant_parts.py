@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from enact_dist.core.prepares import PrepareDesk
+from enact_dist.core.shard.on_prepare import PrepareDesk
 
 if TYPE_CHECKING:
     from collections.abc import Callable

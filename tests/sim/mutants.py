@@ -86,6 +86,8 @@ def planted(mutant: Mutant) -> Iterator[None]:
     undo: list[tuple[Any, str, Any]] = []
 
     def patch(owner: Any, name: str, value: Any) -> None:
+        family = getattr(owner, "__mro__", (owner,))
+        owner = next((base for base in family if name in vars(base)), owner)
         undo.append((owner, name, vars(owner)[name]))
         setattr(owner, name, value)
 

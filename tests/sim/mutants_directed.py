@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING, Any
 
 from mutant_parts import forgets_what_ended
 
-from enact_dist.core.commits import Commits
-from enact_dist.core.cuts import Cut
-from enact_dist.core.lock_desk import LockDesk
-from enact_dist.core.messages import Granted
-from enact_dist.core.multilock import MultiLock
-from enact_dist.core.records import Persist, PreparedEnded
-from enact_dist.core.sessions import Session, SessionTable
-from enact_dist.core.slot_history import SlotHistory
-from enact_dist.core.slots import SlotMap
-from enact_dist.core.tenures import Tenures
-from enact_dist.core.unsettled import Unsettled
-from enact_dist.core.view_desk import ViewDesk
+from enact_dist.core.client.cut import Cut
+from enact_dist.core.client.lock import MultiLock
+from enact_dist.core.client.own_commits import Unsettled
+from enact_dist.core.protocol.messages import Granted
+from enact_dist.core.protocol.records import Persist, PreparedEnded
+from enact_dist.core.shard.on_lock import LockDesk
+from enact_dist.core.shard.on_view import ViewDesk
+from enact_dist.core.state.commits import Commits
+from enact_dist.core.state.grants import Tenures
+from enact_dist.core.state.sessions import Session, SessionTable
+from enact_dist.core.state.slot_history import SlotHistory
+from enact_dist.core.state.slots import SlotMap
 from enact_dist.terms import Durability
 
 if TYPE_CHECKING:

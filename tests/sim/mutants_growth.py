@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from enact_dist.core.catalogue import Catalogue
-from enact_dist.core.lock_desk import LockDesk
-from enact_dist.link.catalogue import KnownCatalogue
+from enact_dist.core.shard.on_lock import LockDesk
+from enact_dist.core.state.catalogue import Catalogue
+from enact_dist.link.client.catalogue import KnownCatalogue
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -6,12 +6,12 @@ from bisect import bisect_left
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from enact_dist.core.history import History
-from enact_dist.core.history_desk import HistoryDesk
-from enact_dist.core.messages import TakeView
-from enact_dist.core.slot_history import SlotHistory
-from enact_dist.core.slots import SlotMap
-from enact_dist.core.view_desk import ViewDesk
+from enact_dist.core.protocol.messages import TakeView
+from enact_dist.core.shard.on_history import HistoryDesk
+from enact_dist.core.shard.on_view import ViewDesk
+from enact_dist.core.state.history import History
+from enact_dist.core.state.slot_history import SlotHistory
+from enact_dist.core.state.slots import SlotMap
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

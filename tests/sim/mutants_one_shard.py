@@ -9,23 +9,25 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from enact_dist.core import lock_table, multilock, tenures
-from enact_dist.core.beliefs import SENDINGS_KEPT, Sendings
-from enact_dist.core.catalogue import Catalogue
-from enact_dist.core.client import Client
-from enact_dist.core.commits import Commits
-from enact_dist.core.datum import Token
-from enact_dist.core.lock_table import Mode
-from enact_dist.core.messages import Alive, Commit, Granted, GrantLeft, KeepAlive
-from enact_dist.core.multilock import MultiLock
-from enact_dist.core.phase import Phase
-from enact_dist.core.records import Persist, Reply
-from enact_dist.core.session_desk import SessionDesk
-from enact_dist.core.sessions import Lane, Session, SessionTable
-from enact_dist.core.shard_state import ShardState
-from enact_dist.core.slots import Content, SlotMap
-from enact_dist.core.stamps import Stamps
-from enact_dist.core.tenures import Tenure, Tenures
+from enact_dist.core.client import lock as multilock
+from enact_dist.core.client.client import Client
+from enact_dist.core.client.lease_clock import SENDINGS_KEPT, Sendings
+from enact_dist.core.client.lock import MultiLock
+from enact_dist.core.client.plan import Phase
+from enact_dist.core.protocol.datum import Token
+from enact_dist.core.protocol.messages import Alive, Commit, Granted, GrantLeft, KeepAlive
+from enact_dist.core.protocol.records import Content, Persist, Reply
+from enact_dist.core.shard.on_session import SessionDesk
+from enact_dist.core.shard.state import ShardState
+from enact_dist.core.state import grants as tenures
+from enact_dist.core.state import lock_table
+from enact_dist.core.state.catalogue import Catalogue
+from enact_dist.core.state.clock import Stamps
+from enact_dist.core.state.commits import Commits
+from enact_dist.core.state.grants import Tenure, Tenures
+from enact_dist.core.state.lock_table import Mode
+from enact_dist.core.state.sessions import Lane, Session, SessionTable
+from enact_dist.core.state.slots import SlotMap
 from enact_dist.terms import Durability, NullReason
 
 if TYPE_CHECKING:
@@ -227,16 +229,14 @@ def stamps_follow_the_wall_clock(patch: Patch) -> None:
 
 def numbers_start_anew(patch: Patch) -> None:
     """Tokens say nothing of the epoch, so they repeat after a restart."""
-    grant_ready = Tenures.grant_ready
+    begin = Tenures._begin
 
-    def wrong(self: Tenures, **options: Any) -> Any:
-        effects = list(grant_ready(self, **options))
-        for tenure in self.by_lock.values():
-            if tenure.token is not None:
-                tenure.token = Token(1, tenure.token.number)
-        yield from effects
+    def wrong(self: Tenures, tenure: Tenure, **options: Any) -> None:
+        begin(self, tenure, **options)
+        assert tenure.token is not None
+        tenure.token = Token(1, tenure.token.number)
 
-    patch(Tenures, "grant_ready", wrong)
+    patch(Tenures, "_begin", wrong)
 
 
 def retries_with_another_commit(patch: Patch) -> None:

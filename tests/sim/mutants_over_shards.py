@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING, Any
 
 from mutant_parts import forgets_what_ended
 
-from enact_dist.core import prepares
-from enact_dist.core.commits import Commits
-from enact_dist.core.cuts import Cut
-from enact_dist.core.decisions import Decisions
-from enact_dist.core.messages import Finished
-from enact_dist.core.multilock import MultiLock
-from enact_dist.core.phase import Phase
-from enact_dist.core.prepares import PrepareDesk
-from enact_dist.core.records import Persist, PreparedEnded, Reply
-from enact_dist.core.tenures import Tenure
-from enact_dist.core.view_desk import ViewDesk
+from enact_dist.core.client.cut import Cut
+from enact_dist.core.client.lock import MultiLock
+from enact_dist.core.client.plan import Phase
+from enact_dist.core.protocol.messages import Finished
+from enact_dist.core.protocol.records import Persist, PreparedEnded, Reply
+from enact_dist.core.shard import on_prepare as prepares
+from enact_dist.core.shard.on_prepare import PrepareDesk
+from enact_dist.core.shard.on_view import ViewDesk
+from enact_dist.core.state.commits import Commits
+from enact_dist.core.state.decisions import Decisions
+from enact_dist.core.state.grants import Tenure
 from enact_dist.terms import Durability
 
 if TYPE_CHECKING:

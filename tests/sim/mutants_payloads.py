@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from enact_dist.link import payload_desk
-from enact_dist.link.payload_desk import PayloadDesk
-from enact_dist.link.used_names import UsedNames
+from enact_dist.link.memory import payload_desk
+from enact_dist.link.memory.names import UsedNames
+from enact_dist.link.memory.payload_desk import PayloadDesk
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from enact_dist.core.client import Client
-from enact_dist.core.history import History
-from enact_dist.core.slot_history import SlotHistory
-from enact_dist.core.slots import Shown, SlotMap
-from enact_dist.core.unsettled import Unsettled
+from enact_dist.core.client.client import Client
+from enact_dist.core.client.own_commits import Unsettled
+from enact_dist.core.state.history import History
+from enact_dist.core.state.slot_history import SlotHistory
+from enact_dist.core.state.slots import Shown, SlotMap
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from enact_dist.core import commits, prepares
-from enact_dist.core.commits import Commits
-from enact_dist.core.messages import DropWorld
-from enact_dist.core.records import Persist, Publish
-from enact_dist.core.shard_state import ShardState
-from enact_dist.core.slots import SlotMap
-from enact_dist.core.worlds import WorldDesk, _Making
+from enact_dist.core.protocol.messages import DropWorld
+from enact_dist.core.protocol.records import Persist, Publish
+from enact_dist.core.shard import on_prepare as prepares
+from enact_dist.core.shard.on_world import WorldDesk, _Making
+from enact_dist.core.shard.state import ShardState
+from enact_dist.core.state import commits
+from enact_dist.core.state.commits import Commits
+from enact_dist.core.state.slots import SlotMap
 
 if TYPE_CHECKING:
     from collections.abc import Callable

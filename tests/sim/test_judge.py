@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import pytest
 
-from enact_dist.core.datum import Datum, LockId, Token
-from enact_dist.core.messages import AspectEntry, Refused, Register
-from enact_dist.core.phase import Phase
-from enact_dist.core.records import Persist, Persisted, PreparedEnded, PreparedRecord, Tick
+from enact_dist.core.client.plan import Phase
+from enact_dist.core.protocol.datum import Datum, LockId, Token
+from enact_dist.core.protocol.messages import AspectEntry, Refused, Register
+from enact_dist.core.protocol.records import Persist, Persisted, PreparedEnded, PreparedRecord, Tick
 from enact_dist.terms import Durability
 from enact_dist.verify.simulation.faults import NONE
 from enact_dist.verify.simulation.growth_judge import NEWER, NEWER_ENCODING, OLDER

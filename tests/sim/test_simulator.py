@@ -7,9 +7,9 @@ from random import Random
 
 import pytest
 
-from enact_dist.core.messages import Item, PlacementMap, ShardEntry
-from enact_dist.core.placement import shard_of
-from enact_dist.core.records import Persist, SessionRecord
+from enact_dist.core.protocol.messages import Item, PlacementMap, ShardEntry
+from enact_dist.core.protocol.placement import shard_of
+from enact_dist.core.protocol.records import Persist, SessionRecord
 from enact_dist.terms import Access, Durability
 from enact_dist.verify.simulation.disk import Disk
 from enact_dist.verify.simulation.faults import NONE, drawn

@@ -24,7 +24,7 @@ from enact_dist import (
     WriteEach,
     connect,
 )
-from enact_dist.lineage import CauseTree
+from enact_dist.world.lineage import CauseTree
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ import socket
 
 import pytest
 
-from enact_dist.config import load_config
+from enact_dist.config.read import load_config
 from enact_dist.errors import LinkError
 from enact_dist.verify.chaos.hosts import Loopback
 from enact_dist.verify.chaos.watcher import Watcher

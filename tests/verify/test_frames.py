@@ -7,10 +7,10 @@ import json
 import pytest
 
 from enact_dist.cli.main import main
-from enact_dist.core import inspection
-from enact_dist.core.lock_desk import LockDesk
-from enact_dist.core.messages import Pong
-from enact_dist.core.shard import Shard
+from enact_dist.core.protocol.messages import Pong
+from enact_dist.core.shard import inspection
+from enact_dist.core.shard.on_lock import LockDesk
+from enact_dist.core.shard.shard import Shard
 from enact_dist.verify.frames.hostile import KINDS
 from enact_dist.verify.frames.lives import STORE_EVERY, Broken, Tally, live
 from enact_dist.verify.simulation.series import fresh_seed

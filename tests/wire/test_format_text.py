@@ -7,8 +7,8 @@ import msgpack
 import numpy as np
 
 from enact_dist import wire
-from enact_dist.core import messages as m
-from enact_dist.core.datum import Datum, LockId, Slot, Token
+from enact_dist.core.protocol import messages as m
+from enact_dist.core.protocol.datum import Datum, LockId, Slot, Token
 from enact_dist.wire import limits
 from enact_dist.wire.frames import CODES, encode_frame
 from enact_dist.wire.payload import encode_datum

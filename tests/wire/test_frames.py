@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from wire_samples import CLASSES, messages
 
-from enact_dist.core import messages as m
-from enact_dist.core.datum import Datum, LockId, Slot, Token
+from enact_dist.core.protocol import messages as m
+from enact_dist.core.protocol.datum import Datum, LockId, Slot, Token
 from enact_dist.errors import ProtocolError
 from enact_dist.wire.frames import CODES, decode_frame, encode_frame
 from enact_dist.wire.limits import ALIGNMENT, SMALL_BODY_BYTES

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from wire_samples import CLASSES, damaged, sample
 
-from enact_dist.core import messages as m
-from enact_dist.core.datum import Datum, LockId, Slot, Token
+from enact_dist.core.protocol import messages as m
+from enact_dist.core.protocol.datum import Datum, LockId, Slot, Token
 from enact_dist.errors import ProtocolError
 from enact_dist.wire import limits
 from enact_dist.wire.frames import CODES, decode_frame, encode_frame

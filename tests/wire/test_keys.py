@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from enact_dist.core import messages as m
-from enact_dist.core.datum import LockId, Token
+from enact_dist.core.protocol import messages as m
+from enact_dist.core.protocol.datum import LockId, Token
 from enact_dist.errors import ProtocolError
 from enact_dist.wire.keys import (
     ANY,

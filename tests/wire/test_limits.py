@@ -6,8 +6,8 @@ import msgpack
 import numpy as np
 import pytest
 
-from enact_dist.core import messages as m
-from enact_dist.core.datum import Datum, LockId, Slot, Token
+from enact_dist.core.protocol import messages as m
+from enact_dist.core.protocol.datum import Datum, LockId, Slot, Token
 from enact_dist.errors import DatumTypeError, ProtocolError
 from enact_dist.wire import limits
 from enact_dist.wire.frames import decode_frame, encode_frame

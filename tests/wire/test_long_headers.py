@@ -3,8 +3,8 @@
 import msgpack
 import pytest
 
-from enact_dist.core import messages as m
-from enact_dist.core.datum import Datum, LockId, Slot, Token
+from enact_dist.core.protocol import messages as m
+from enact_dist.core.protocol.datum import Datum, LockId, Slot, Token
 from enact_dist.errors import ProtocolError
 from enact_dist.wire import limits
 from enact_dist.wire.frames import CODES, decode_frame, decode_request, encode_frame

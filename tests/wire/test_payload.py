@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as nps
 from numpy.typing import NDArray
 
-from enact_dist.core.datum import Datum
+from enact_dist.core.protocol.datum import Datum
 from enact_dist.errors import DatumTypeError
 from enact_dist.wire.codecs import register_codec
 from enact_dist.wire.limits import ALIGNMENT, ENCODING_BYTES_MAX, INLINE_BYTES_MAX

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from wire_samples import damaged
 
-from enact_dist.core.datum import Datum
+from enact_dist.core.protocol.datum import Datum
 from enact_dist.errors import DatumTypeError, ProtocolError
 from enact_dist.wire.payload import decode_datum, decode_untyped, encode_datum
 from enact_dist.wire.tree_writer import ARRAY, BYTES, CODEC, RECORD, TEXT, TREE, TUPLE, reference

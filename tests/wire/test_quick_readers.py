@@ -3,19 +3,29 @@
 from __future__ import annotations
 
 import random
+from typing import get_args
 
 import msgpack
 import pytest
 from wire_samples import CLASSES, sample
 
+from enact_dist.core.protocol.messages import Request
 from enact_dist.errors import ProtocolError
 from enact_dist.wire import frames
 from enact_dist.wire.bodies import BodyReader
 from enact_dist.wire.frames import CODES, decode_frame, encode_frame
 from enact_dist.wire.message_parts import reader_of
-from enact_dist.wire.quick_readers import quick_reader_of
+from enact_dist.wire.quick_readers import quick_reader_of, safe_reader
 
 WRONG = (None, True, 0, -1, 1 << 63, 0.5, "", "x" * 201, b"", b"y" * 70_000, (), ("a",), (1, 2, 3))
+TEXTS = ("a\x1b[2Jb", "line\nbreak", "right\u202eleft", "a\u00a0space", ("\x07",), ("a", "\x07"))
+"""The fourth one is not printable, and safe all the same."""
+REQUESTS = frozenset(get_args(Request))
+
+
+def general_reader_of(cls):
+    """Return the general reader of a message, with the check of the texts of a request."""
+    return safe_reader(reader_of(cls)) if cls in REQUESTS else reader_of(cls)
 
 
 def result(read, raw, payload):
@@ -46,14 +56,15 @@ def with_other(raw, path, other):
 def test_quick_reader_agrees(cls):
     """Samples, and samples with one wrong value anywhere: same message, or same refusal."""
     generator = random.Random(20261121)
-    judge, quick = reader_of(cls), quick_reader_of(cls)
+    judge = general_reader_of(cls)
+    quick = quick_reader_of(cls, judge, printable=cls in REQUESTS)
     refused = 0
 
     for _ in range(4):
         header, payload = encode_frame(sample(cls, generator))
         raw = msgpack.unpackb(header, use_list=False)[2:]
         assert result(quick, raw, payload or b"") == result(judge, raw, payload or b"")
-        raws = [with_other(raw, path, wrong) for path in places(raw) for wrong in WRONG]
+        raws = [with_other(raw, path, wrong) for path in places(raw) for wrong in (*WRONG, *TEXTS)]
         for wrong_raw in (*raws, raw[:-1], (*raw, 1), [*raw], None, 7):
             expected = result(judge, wrong_raw, payload or b"")
             assert result(quick, wrong_raw, payload or b"") == expected, wrong_raw
@@ -68,7 +79,7 @@ def damaged(header, payload, draw):
     if way == 0:
         raw = msgpack.unpackb(header, use_list=False)
         for _ in range(draw.randrange(1, 4)):
-            raw = with_other(raw, draw.choice(list(places(raw))), draw.choice(WRONG))
+            raw = with_other(raw, draw.choice(list(places(raw))), draw.choice((*WRONG, *TEXTS)))
         header = msgpack.packb(raw)
     elif way == 1:
         flipped = bytearray(header)
@@ -95,7 +106,7 @@ def answer_of(header, payload):
 def test_damaged_frames_pass_both_or_neither(monkeypatch):
     """What the general reader refuses does not pass a quick one, however a frame is damaged."""
     draw = random.Random(188545)
-    general = {code: reader_of(cls) for cls, code in CODES.items()}
+    general = {code: general_reader_of(cls) for cls, code in CODES.items()}
     quick, passed, refused = frames._readers, 0, 0
 
     hot = [cls for cls in CLASSES if cls in frames._OF_EVERY_LOCK]

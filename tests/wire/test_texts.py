@@ -9,8 +9,8 @@ from typing import Any, get_args
 import msgpack
 import pytest
 
-from enact_dist.core.datum import LockId
-from enact_dist.core.messages import Break, Fenced, Hello, ListAudit, Request
+from enact_dist.core.protocol.datum import LockId
+from enact_dist.core.protocol.messages import Break, Fenced, Hello, ListAudit, Request
 from enact_dist.errors import ProtocolError
 from enact_dist.verify.frames.hostile import Hostile
 from enact_dist.wire.frames import decode_frame, encode_frame

@@ -9,7 +9,7 @@ from functools import cache
 
 from hypothesis import strategies as st
 
-from enact_dist.core.datum import Datum
+from enact_dist.core.protocol.datum import Datum
 from enact_dist.wire.frames import CODES
 from enact_dist.wire.limits import PAYLOAD_NAME
 from enact_dist.wire.texts import is_safe
@@ -36,7 +36,7 @@ def alternatives(kind):
 
 @cache
 def messages(kind):
-    """Return a strategy for values of an annotation of `core.messages`."""
+    """Return a strategy for values of an annotation of `core.protocol.messages`."""
     inner, may_be_none = alternatives(kind)
     if inner:
         return st.one_of(*[st.none()] * may_be_none, *map(messages, inner))

@@ -9,7 +9,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.config_environment import without_overrides
+from enact_dist.config.environment import without_overrides
 from enact_dist.errors import LinkError
 from enact_dist.verify.chaos import daemon
 from enact_dist.verify.chaos.journal import SUFFIX

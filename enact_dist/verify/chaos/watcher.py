@@ -23,7 +23,7 @@ from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Final
 
 from enact_dist import connect
-from enact_dist.core.messages import ListLocks, ListSessions, Locks, Sessions
+from enact_dist.core.protocol.messages import ListLocks, ListSessions, Locks, Sessions
 from enact_dist.verify.chaos.journal import SUFFIX, Journal
 from enact_dist.verify.chaos.workload import Workload
 from enact_dist.verify.checker import Told

@@ -24,8 +24,8 @@ from enact_dist import (
     Write,
     WriteEach,
 )
-from enact_dist.core.datum import Slot
-from enact_dist.core.placement import shard_of
+from enact_dist.core.protocol.datum import Slot
+from enact_dist.core.protocol.placement import shard_of
 from enact_dist.errors import (
     ChangedError,
     ClockSkewError,

@@ -7,8 +7,8 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.datum import LockId
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.datum import LockId
+from enact_dist.core.protocol.messages import (
     Acquire,
     AwaitStamp,
     Item,
@@ -21,8 +21,8 @@ from enact_dist.verify.floods.victim import HELD, KEPT, WORLD
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from enact_dist.config_types import CellConfig
-    from enact_dist.core.messages import Request, Welcome
+    from enact_dist.config.types import CellConfig
+    from enact_dist.core.protocol.messages import Request, Welcome
 
 FIRST: Final = "left"
 """The shard on which everything of the honest client lies."""

@@ -14,7 +14,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Final
 
-from enact_dist.config import load_config
+from enact_dist.config.read import load_config
 from enact_dist.errors import LinkError
 from enact_dist.verify.floods.attacker import FIRST, Attacker
 from enact_dist.verify.floods.attacks import ATTACKS, Attack

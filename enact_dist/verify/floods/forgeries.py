@@ -10,8 +10,8 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from enact_dist.core.datum import Datum, LockId, Position, Slot, Token
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.datum import Datum, LockId, Position, Slot, Token
+from enact_dist.core.protocol.messages import (
     Commit,
     Finish,
     Goodbye,
@@ -36,7 +36,7 @@ from enact_dist.wire.keys import identity_of, token_key
 from enact_dist.wire.limits import INTEGER_MAX
 
 if TYPE_CHECKING:
-    from enact_dist.core.messages import Request
+    from enact_dist.core.protocol.messages import Request
     from enact_dist.verify.floods.attacker import Attacker
 
 

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Final
 
 import msgpack
 
-from enact_dist.core.datum import Datum, Slot, Token
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.datum import Datum, Slot, Token
+from enact_dist.core.protocol.messages import (
     AspectEntry,
     AwaitStamp,
     Commit,
@@ -34,8 +34,8 @@ from enact_dist.core.messages import (
     WriteItem,
 )
 from enact_dist.errors import LinkError
-from enact_dist.link.endpoints import split_endpoint
-from enact_dist.link.socket_frames import MAGIC, STREAM_VERSION, Kind
+from enact_dist.link.socket.frames import MAGIC, STREAM_VERSION, Kind
+from enact_dist.link.zenoh.endpoints import split_endpoint
 from enact_dist.terms import Access
 from enact_dist.verify.floods.attacker import FIRST, line_of
 from enact_dist.verify.floods.raw import RawSocket, fresh_session, hello

@@ -18,20 +18,20 @@ from typing import TYPE_CHECKING, Final
 
 import zenoh
 
-from enact_dist.core.messages import Hello, Refused, Welcome
+from enact_dist.core.protocol.messages import Hello, Refused, Welcome
 from enact_dist.errors import LinkError, ProtocolError
-from enact_dist.link.shared_folder import open_shared
-from enact_dist.link.socket_frames import Kind, Stream, greeting_of, send_frame, wait_at_most
-from enact_dist.link.socket_service import SOCKET_NAME
-from enact_dist.link.zenoh_config import session_config
+from enact_dist.link.memory.shared_folder import open_shared
+from enact_dist.link.socket.frames import Kind, Stream, greeting_of, send_frame, wait_at_most
+from enact_dist.link.socket.service import SOCKET_NAME
+from enact_dist.link.zenoh.config import session_config
 from enact_dist.wire.frames import decode_frame, encode_frame
 from enact_dist.wire.keys import request_key, verb_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from enact_dist.config_types import CellConfig
-    from enact_dist.core.messages import Answer, Request
+    from enact_dist.config.types import CellConfig
+    from enact_dist.core.protocol.messages import Answer, Request
 
 ACTOR: Final = "attacker"
 SILENT: Final = "no answer"

@@ -10,13 +10,13 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from enact_dist.connecting import connect
+from enact_dist.access.lock import Lock
 from enact_dist.errors import EnactError
-from enact_dist.lock import Lock
 from enact_dist.terms import View
 from enact_dist.verify.daemons import CellProcesses
 from enact_dist.verify.floods.attacker import FIRST, SECOND
 from enact_dist.verify.floods.victim import HELD, KEPT, WORLD
+from enact_dist.world.connecting import connect
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -6,7 +6,7 @@ import sys
 import time
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.cli.output import print_json
+from enact_dist.cli.text.output import print_json
 from enact_dist.cli.verbs import DONE, FAILED
 from enact_dist.verify.frames.lives import Broken, Tally, live
 from enact_dist.verify.simulation.series import fresh_seed

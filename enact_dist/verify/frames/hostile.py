@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any, Final, get_args, get_origin
 
-from enact_dist.core.datum import Datum, LockId, Position, Slot
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.datum import Datum, LockId, Position, Slot
+from enact_dist.core.protocol.messages import (
     START,
     Acquire,
     Commit,

@@ -18,9 +18,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, cast
 
-from enact_dist.core.datum import Token
-from enact_dist.core.ledger import Ledger
-from enact_dist.core.messages import (
+from enact_dist.core.offline.ledger import Ledger
+from enact_dist.core.protocol.datum import Token
+from enact_dist.core.protocol.messages import (
     AspectEntry,
     Granted,
     Hello,
@@ -29,8 +29,7 @@ from enact_dist.core.messages import (
     Resolve,
     ShardEntry,
 )
-from enact_dist.core.owners import shard_identity
-from enact_dist.core.records import (
+from enact_dist.core.protocol.records import (
     Call,
     Called,
     Drain,
@@ -41,18 +40,19 @@ from enact_dist.core.records import (
     Reply,
     Tick,
 )
-from enact_dist.core.shard import Shard
-from enact_dist.core.shard_state import ShardSettings
+from enact_dist.core.shard.owners import shard_identity
+from enact_dist.core.shard.shard import Shard
+from enact_dist.core.shard.state import ShardSettings
 from enact_dist.errors import ProtocolError
 from enact_dist.link.host import open_host
-from enact_dist.link.shared_folder import SharedFolder
+from enact_dist.link.memory.shared_folder import SharedFolder
 from enact_dist.verify.frames.hostile import SESSIONS, Hostile
 from enact_dist.wire.frames import decode_frame, encode_frame
 
 if TYPE_CHECKING:
-    from enact_dist.core.datum import LockId
-    from enact_dist.core.messages import Answer, Request
-    from enact_dist.core.records import Effect, Event, Record
+    from enact_dist.core.protocol.datum import LockId
+    from enact_dist.core.protocol.messages import Answer, Request
+    from enact_dist.core.protocol.records import Effect, Event, Record
 
 FRAMES: Final = 60
 """Frames of one life."""

@@ -1,19 +1,19 @@
 """What the simulated threads do by capture stamp: data that belong together, found and viewed.
 
 Data are stamped with the tick of true time in which they are made, a few late or not at all.  As
-`enact_dist.together` does, a thread waits until its own commits are shown, asks which versions are
-retained, and views the newest stamp that all its slots have.
+`enact_dist.access.together` does, a thread waits until its own commits are shown, asks which
+versions are retained, and views the newest stamp that all its slots have.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.datum import Slot
-from enact_dist.core.messages import AwaitStamp, Reached, Survey, Surveyed
-from enact_dist.core.placement import shard_of
+from enact_dist.access.together import Captured, newest_set_ns
+from enact_dist.core.protocol.datum import Slot
+from enact_dist.core.protocol.messages import AwaitStamp, Reached, Survey, Surveyed
+from enact_dist.core.protocol.placement import shard_of
 from enact_dist.terms import Access
-from enact_dist.together import Captured, newest_set_ns
 from enact_dist.verify.simulation.client_host import Calls, ClientHost, Steps
 from enact_dist.verify.simulation.world import MS
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
     from random import Random
 
-    from enact_dist.core.messages import Item
+    from enact_dist.core.protocol.messages import Item
     from enact_dist.verify.simulation.model import Model
     from enact_dist.verify.simulation.world import World
 

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.datum import LockId, Slot
-from enact_dist.core.message_parts import CAUSE_COMMIT
-from enact_dist.core.messages import Cause, DatumRead, SlotVersion
+from enact_dist.core.protocol.datum import LockId, Slot
+from enact_dist.core.protocol.messages import Cause, DatumRead, SlotVersion
+from enact_dist.core.protocol.parts import CAUSE_COMMIT
 from enact_dist.terms import Access
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from enact_dist.core.messages import Notice
-    from enact_dist.core.slots import Content
+    from enact_dist.core.protocol.messages import Notice
+    from enact_dist.core.protocol.records import Content
     from enact_dist.verify.simulation.history import Entry, History
     from enact_dist.verify.simulation.picture import Picture
     from enact_dist.verify.simulation.shard_host import ShardHost

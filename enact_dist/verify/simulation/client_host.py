@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
-from enact_dist.core.client import Client
-from enact_dist.core.messages import (
+from enact_dist.core.client.client import Client
+from enact_dist.core.protocol.messages import (
     Acquire,
     Answer,
     AspectEntry,
@@ -23,14 +23,14 @@ from enact_dist.core.messages import (
     Registered,
     Request,
 )
-from enact_dist.link.catalogue import CATALOGUES, KnownCatalogue
+from enact_dist.link.client.catalogue import CATALOGUES, KnownCatalogue
 from enact_dist.verify.simulation.world import MS, Host, S
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from enact_dist.core.datum import Datum, Slot
-    from enact_dist.core.multilock import MultiLock
+    from enact_dist.core.client.lock import MultiLock
+    from enact_dist.core.protocol.datum import Datum, Slot
     from enact_dist.verify.simulation.faults import Faults
     from enact_dist.verify.simulation.model import Model
     from enact_dist.verify.simulation.network import Network
@@ -242,7 +242,7 @@ class ClientHost(Host):
             self.client.answered(shard, request, answer, self.local_ns)
 
     def learn(self, shard: str, answer: Answer, *, sent_in: int = 0) -> None:
-        """Take the catalogue that an answer carries, as `link.session_client` does."""
+        """Take the catalogue that an answer carries, as `link.client.session` does."""
         if isinstance(answer, CATALOGUES):
             self.catalogue.learn(shard, answer, sent_in=sent_in)
             self.client.knows_types(shard, self.catalogue.successions(shard))

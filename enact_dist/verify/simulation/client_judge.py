@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from enact_dist.core.messages import Forgotten
-from enact_dist.core.phase import Phase
+from enact_dist.core.client.plan import Phase
+from enact_dist.core.protocol.messages import Forgotten
 from enact_dist.terms import Access, Durability
 from enact_dist.verify.simulation.cells import CONTEXTS
 from enact_dist.verify.simulation.history import TOLD_NOT, Entry, History, conflict
 
 if TYPE_CHECKING:
-    from enact_dist.core.datum import Datum, Slot
-    from enact_dist.core.lock_parts import Reading
-    from enact_dist.core.messages import Surveyed
-    from enact_dist.core.multilock import MultiLock
+    from enact_dist.core.client.lock import MultiLock
+    from enact_dist.core.client.plan import Reading
+    from enact_dist.core.protocol.datum import Datum, Slot
+    from enact_dist.core.protocol.messages import Surveyed
     from enact_dist.verify.simulation.client_host import ClientHost
     from enact_dist.verify.simulation.model import Model
     from enact_dist.verify.simulation.world import World

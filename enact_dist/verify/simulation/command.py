@@ -7,7 +7,7 @@ import sys
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.cli.output import print_json, shown_s
+from enact_dist.cli.text.output import print_json, shown_s
 from enact_dist.cli.verbs import DONE, FAILED
 from enact_dist.errors import ConfigError
 from enact_dist.verify.simulation.scenario import Scenario

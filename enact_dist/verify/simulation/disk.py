@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from enact_dist.core.ledger import Ledger
+from enact_dist.core.offline.ledger import Ledger
 from enact_dist.terms import Durability
 from enact_dist.verify.simulation.world import MS
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from random import Random
 
-    from enact_dist.core.records import Persist, Recovered
+    from enact_dist.core.protocol.records import Persist, Recovered
     from enact_dist.verify.simulation.faults import Faults
     from enact_dist.verify.simulation.world import Host, World
 

@@ -9,7 +9,8 @@ from __future__ import annotations
 from random import Random
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.messages import (
+from enact_dist.core.client.lock import OVERLOAD
+from enact_dist.core.protocol.messages import (
     AwaitStamp,
     Dropped,
     DropWorld,
@@ -21,7 +22,6 @@ from enact_dist.core.messages import (
     Reached,
     Refused,
 )
-from enact_dist.core.multilock import OVERLOAD
 from enact_dist.terms import Access
 from enact_dist.verify.simulation.cells import CONTEXTS
 from enact_dist.verify.simulation.client_host import Calls, Sleep, Steps
@@ -31,7 +31,7 @@ from enact_dist.verify.simulation.world import MS, S
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from enact_dist.core.messages import Answer, Request
+    from enact_dist.core.protocol.messages import Answer, Request
     from enact_dist.verify.simulation.client_host import ClientHost, Thread
     from enact_dist.verify.simulation.model import Model
     from enact_dist.verify.simulation.workload import Workload

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from enact_dist.core.phase import Phase
+from enact_dist.core.client.plan import Phase
 from enact_dist.terms import NullReason
 from enact_dist.verify.checker import (
     NOTHING,
@@ -26,8 +26,8 @@ from enact_dist.verify.simulation.reader_judge import stamp_of
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from enact_dist.core import lock_parts
-    from enact_dist.core.datum import Slot
+    from enact_dist.core.client import plan as lock_parts
+    from enact_dist.core.protocol.datum import Slot
     from enact_dist.verify.simulation.history import Entry, History
     from enact_dist.verify.simulation.model import Model
 

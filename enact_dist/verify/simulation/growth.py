@@ -5,17 +5,18 @@ these shards refuse a process with the older program as a writer.  It goes on re
 some refusals it runs the newer program too.
 
 The core decides which types go together and who may write.  Outside it, the client compares types
-before it asks for a lock, after a refusal, and after a grant if a catalogue changed meanwhile: here
-as in `enact_dist.session` and `enact_dist.link.client`, with the real `KnownCatalogue`.
+before it asks for a lock, after a refusal, and after a grant if a catalogue changed meanwhile:
+here as in `enact_dist.access.session` and `enact_dist.link.client.locks`, with the real
+`KnownCatalogue`.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.lock_desk import NEWER_TYPE
-from enact_dist.core.messages import AspectEntry, Refused, Register, Request
-from enact_dist.core.placement import shard_of
+from enact_dist.core.protocol.messages import AspectEntry, Refused, Register, Request
+from enact_dist.core.protocol.placement import shard_of
+from enact_dist.core.shard.on_lock import NEWER_TYPE
 from enact_dist.terms import Access
 from enact_dist.verify.simulation.client_host import Calls, ClientHost, Sleep, Steps
 from enact_dist.verify.simulation.growth_judge import NEWER, NEWER_ENCODING, OLDER
@@ -25,9 +26,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from random import Random
 
-    from enact_dist.core.datum import Datum, Slot
-    from enact_dist.core.messages import Item
-    from enact_dist.core.multilock import MultiLock
+    from enact_dist.core.client.lock import MultiLock
+    from enact_dist.core.protocol.datum import Datum, Slot
+    from enact_dist.core.protocol.messages import Item
     from enact_dist.verify.simulation.model import Model
     from enact_dist.verify.simulation.world import World
 

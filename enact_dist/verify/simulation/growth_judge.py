@@ -7,17 +7,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.datum_types import succeeds
-from enact_dist.core.lock_desk import NEWER_TYPE
-from enact_dist.core.messages import Acquire, Refused, Register, Registered, Welcome
-from enact_dist.core.records import Reply
+from enact_dist.core.protocol.datum_types import succeeds
+from enact_dist.core.protocol.messages import Acquire, Refused, Register, Registered, Welcome
+from enact_dist.core.protocol.records import Reply
+from enact_dist.core.shard.on_lock import NEWER_TYPE
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from enact_dist.core.datum import Datum, Slot
-    from enact_dist.core.messages import AspectEntry
-    from enact_dist.core.records import Effect
+    from enact_dist.core.protocol.datum import Datum, Slot
+    from enact_dist.core.protocol.messages import AspectEntry
+    from enact_dist.core.protocol.records import Effect
     from enact_dist.verify.simulation.client_host import ClientHost
     from enact_dist.verify.simulation.history import Entry
     from enact_dist.verify.simulation.picture import Picture

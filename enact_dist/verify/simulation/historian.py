@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.messages import Item, KeepVersions, ListHistory, SlotVersion, Versions
-from enact_dist.core.phase import Phase
+from enact_dist.core.client.plan import Phase
+from enact_dist.core.protocol.messages import Item, KeepVersions, ListHistory, SlotVersion, Versions
 from enact_dist.terms import Access
 from enact_dist.verify.simulation.cells import CONTEXTS
 from enact_dist.verify.simulation.client_host import Calls, Sleep
@@ -20,7 +20,7 @@ from enact_dist.verify.simulation.world import MS, S
 if TYPE_CHECKING:
     from random import Random
 
-    from enact_dist.core.messages import VersionEntry
+    from enact_dist.core.protocol.messages import VersionEntry
     from enact_dist.verify.simulation.client_host import ClientHost, Steps, Thread
     from enact_dist.verify.simulation.history import History
     from enact_dist.verify.simulation.model import Model

@@ -5,16 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from enact_dist.core.datum import Slot
-from enact_dist.core.phase import Phase
+from enact_dist.core.client.plan import Phase
+from enact_dist.core.protocol.datum import Slot
 from enact_dist.patterns import pattern_matches, patterns_overlap
 from enact_dist.terms import Access
 
 if TYPE_CHECKING:
-    from enact_dist.core.datum import LockId
-    from enact_dist.core.lock_parts import Reading
-    from enact_dist.core.messages import Item
-    from enact_dist.core.multilock import MultiLock
+    from enact_dist.core.client.lock import MultiLock
+    from enact_dist.core.client.plan import Reading
+    from enact_dist.core.protocol.datum import LockId
+    from enact_dist.core.protocol.messages import Item
 
 TOLD_NOT = frozenset(
     (

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from enact_dist.core.datum import LockId, Token
-from enact_dist.core.messages import Acquire, KeepAlive
-from enact_dist.core.records import Tick
+from enact_dist.core.protocol.datum import LockId, Token
+from enact_dist.core.protocol.messages import Acquire, KeepAlive
+from enact_dist.core.protocol.records import Tick
 from enact_dist.verify.simulation.history import conflict
 
 if TYPE_CHECKING:
-    from enact_dist.core.tenures import Tenure
+    from enact_dist.core.state.grants import Tenure
     from enact_dist.verify.simulation.picture import Picture
     from enact_dist.verify.simulation.shard_host import ShardHost
     from enact_dist.verify.simulation.world import World

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from enact_dist.core.datum import Datum, LockId, Slot
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.datum import Datum, LockId, Slot
+from enact_dist.core.protocol.messages import (
     Committed,
     Finished,
     Forgotten,
@@ -30,7 +30,7 @@ from enact_dist.core.messages import (
     Versions,
     Viewed,
 )
-from enact_dist.core.records import (
+from enact_dist.core.protocol.records import (
     DecisionDone,
     DecisionRecord,
     OutcomeRecord,
@@ -43,7 +43,7 @@ from enact_dist.core.records import (
     SessionDied,
     SlotRecord,
 )
-from enact_dist.core.retaining import limits_of
+from enact_dist.core.state.retention import limits_of
 from enact_dist.terms import Durability
 from enact_dist.verify.simulation.cause_judge import CauseJudge
 from enact_dist.verify.simulation.client_judge import ClientJudge
@@ -61,8 +61,8 @@ from enact_dist.verify.simulation.world_judge import WorldJudge
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from enact_dist.core.messages import AspectEntry
-    from enact_dist.core.records import Effect
+    from enact_dist.core.protocol.messages import AspectEntry
+    from enact_dist.core.protocol.records import Effect
     from enact_dist.verify.simulation.history import Entry
     from enact_dist.verify.simulation.shard_host import ShardHost
     from enact_dist.verify.simulation.world import World

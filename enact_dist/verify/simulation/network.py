@@ -11,7 +11,7 @@ from functools import partial
 from random import Random
 from typing import TYPE_CHECKING, Protocol, TypeVar, cast
 
-from enact_dist.core import messages as m
+from enact_dist.core.protocol import messages as m
 
 if TYPE_CHECKING:
     from collections.abc import Callable

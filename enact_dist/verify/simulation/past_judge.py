@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from enact_dist.core.datum import Slot
-from enact_dist.core.messages import (
+from enact_dist.core.protocol.datum import Slot
+from enact_dist.core.protocol.messages import (
     START,
     KeepVersions,
     Kept,
@@ -26,8 +26,8 @@ from enact_dist.verify.simulation.reader_judge import stamp_of
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from enact_dist.core.messages import Forgotten, Item, SlotState, VersionEntry, Versions
-    from enact_dist.core.records import Recovered
+    from enact_dist.core.protocol.messages import Forgotten, Item, SlotState, VersionEntry, Versions
+    from enact_dist.core.protocol.records import Recovered
     from enact_dist.verify.simulation.model import Model
     from enact_dist.verify.simulation.picture import Picture
     from enact_dist.verify.simulation.shard_host import ShardHost

@@ -13,11 +13,11 @@ import weakref
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.datum import Datum
-from enact_dist.core.messages import Commit, EpochChanged, Prepare, Stage, Staged
-from enact_dist.core.records import Persist, PreparedRecord, SlotRecord
-from enact_dist.link.memory import Plain
-from enact_dist.link.payload_desk import PayloadDesk
+from enact_dist.core.protocol.datum import Datum
+from enact_dist.core.protocol.messages import Commit, EpochChanged, Prepare, Stage, Staged
+from enact_dist.core.protocol.records import Persist, PreparedRecord, SlotRecord
+from enact_dist.link.memory.maps import Plain
+from enact_dist.link.memory.payload_desk import PayloadDesk
 from enact_dist.verify.simulation.client_host import Calls, ClientHost, Sleep, Steps, Thread
 from enact_dist.verify.simulation.world import Host, S
 from enact_dist.wire.limits import PAYLOAD_BYTES_MIN
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from random import Random
 
-    from enact_dist.core.messages import Answer, Request, WriteItem
-    from enact_dist.core.records import Effect
-    from enact_dist.core.shard import Shard
+    from enact_dist.core.protocol.messages import Answer, Request, WriteItem
+    from enact_dist.core.protocol.records import Effect
+    from enact_dist.core.shard.shard import Shard
     from enact_dist.verify.simulation.shard_host import ShardHost
     from enact_dist.verify.simulation.world import World
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
-from enact_dist.core.datum import Datum, LockId, Slot, Token
+from enact_dist.core.protocol.datum import Datum, LockId, Slot, Token
 
 if TYPE_CHECKING:
-    from enact_dist.core.messages import AspectEntry, SlotVersion, WorldEntry
-    from enact_dist.core.records import Persist, PreparedRecord
+    from enact_dist.core.protocol.messages import AspectEntry, SlotVersion, WorldEntry
+    from enact_dist.core.protocol.records import Persist, PreparedRecord
 
 
 class State(NamedTuple):

@@ -9,13 +9,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from enact_dist.core.shard import Shard
+from enact_dist.core.shard.shard import Shard
 from enact_dist.terms import Durability
 from enact_dist.verify.simulation.history import conflict
 
 if TYPE_CHECKING:
-    from enact_dist.core.datum import Slot
-    from enact_dist.core.records import Recovered
+    from enact_dist.core.protocol.datum import Slot
+    from enact_dist.core.protocol.records import Recovered
     from enact_dist.verify.simulation.picture import Picture
     from enact_dist.verify.simulation.shard_host import ShardHost
 

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.messages import Granted, Survey, Viewed
+from enact_dist.core.protocol.messages import Granted, Survey, Viewed
 from enact_dist.patterns import pattern_matches
 from enact_dist.terms import Access, NullReason
 from enact_dist.verify.simulation.picture import State
 
 if TYPE_CHECKING:
-    from enact_dist.core.datum import Datum, Slot
-    from enact_dist.core.messages import Item, SlotState, Surveyed
+    from enact_dist.core.protocol.datum import Datum, Slot
+    from enact_dist.core.protocol.messages import Item, SlotState, Surveyed
     from enact_dist.verify.simulation.model import Model
     from enact_dist.verify.simulation.picture import Picture
     from enact_dist.verify.simulation.shard_host import ShardHost

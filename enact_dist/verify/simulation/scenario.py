@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING
 
-from enact_dist.core.messages import PlacementMap, ShardEntry
-from enact_dist.core.records import SessionSeen
-from enact_dist.core.shard_state import ShardSettings
+from enact_dist.core.protocol.messages import PlacementMap, ShardEntry
+from enact_dist.core.protocol.records import SessionSeen
+from enact_dist.core.shard.state import ShardSettings
 from enact_dist.verify.simulation import cells
 from enact_dist.verify.simulation import faults as fault_options
 from enact_dist.verify.simulation.cells import CONTEXTS, WORK_NS

@@ -5,9 +5,17 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, cast
 
-from enact_dist.core.messages import Answer, Finish, Refused, Request, Stage
-from enact_dist.core.records import Call, Called, Persist, Persisted, Reply, SessionSeen, Tick
-from enact_dist.core.shard import Shard
+from enact_dist.core.protocol.messages import Answer, Finish, Refused, Request, Stage
+from enact_dist.core.protocol.records import (
+    Call,
+    Called,
+    Persist,
+    Persisted,
+    Reply,
+    SessionSeen,
+    Tick,
+)
+from enact_dist.core.shard.shard import Shard
 from enact_dist.verify.simulation.disk import Disk
 from enact_dist.verify.simulation.payloads import ShardPayloads, as_kept
 from enact_dist.verify.simulation.world import MS, Host, S
@@ -16,8 +24,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from random import Random
 
-    from enact_dist.core.records import Event
-    from enact_dist.core.shard_state import ShardSettings
+    from enact_dist.core.protocol.records import Event
+    from enact_dist.core.shard.state import ShardSettings
     from enact_dist.verify.simulation.faults import Faults
     from enact_dist.verify.simulation.model import Model
     from enact_dist.verify.simulation.network import Network

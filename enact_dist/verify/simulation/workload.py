@@ -10,9 +10,10 @@ from dataclasses import dataclass, replace
 from random import Random
 from typing import TYPE_CHECKING
 
-from enact_dist.core.datum import Datum, Slot
-from enact_dist.core.lock_parts import Reading
-from enact_dist.core.messages import (
+from enact_dist.core.client.lock import MultiLock
+from enact_dist.core.client.plan import Phase, Reading
+from enact_dist.core.protocol.datum import Datum, Slot
+from enact_dist.core.protocol.messages import (
     AspectEntry,
     Fetch,
     Gone,
@@ -21,9 +22,7 @@ from enact_dist.core.messages import (
     SlotVersion,
     WriteItem,
 )
-from enact_dist.core.multilock import MultiLock
-from enact_dist.core.phase import Phase
-from enact_dist.core.placement import shard_of
+from enact_dist.core.protocol.placement import shard_of
 from enact_dist.terms import Access
 from enact_dist.verify.simulation.captures import Captures, drawn_stamp_ns
 from enact_dist.verify.simulation.cause_judge import reads_of
@@ -303,7 +302,7 @@ class Workload:
 
     @staticmethod
     def _with_known(host: ClientHost, item: Item) -> Item:
-        """Say which version the client still has, as `link.fetching` does."""
+        """Say which version the client still has, as `link.client.fetch` does."""
         slot = Slot(item.context, item.entity, item.aspect)
         known = host.cache.get(slot)
         if known is None or Access(item.access).each:

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from enact_dist.core.message_parts import CAUSE_FORK
-from enact_dist.core.messages import DatumRead, Dropped, Forked, WorldEntry
-from enact_dist.core.records import Reply, WorldDropped, WorldRecord
+from enact_dist.core.protocol.messages import DatumRead, Dropped, Forked, WorldEntry
+from enact_dist.core.protocol.parts import CAUSE_FORK
+from enact_dist.core.protocol.records import Reply, WorldDropped, WorldRecord
 from enact_dist.terms import Durability
 from enact_dist.verify.simulation.payloads import copied
 from enact_dist.verify.simulation.picture import DROP, NEVER_SET, State
@@ -18,10 +18,9 @@ from enact_dist.verify.simulation.picture import DROP, NEVER_SET, State
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from enact_dist.core.datum import Slot
-    from enact_dist.core.messages import Notice
-    from enact_dist.core.records import Effect, Recovered
-    from enact_dist.core.slots import Content
+    from enact_dist.core.protocol.datum import Slot
+    from enact_dist.core.protocol.messages import Notice
+    from enact_dist.core.protocol.records import Content, Effect, Recovered
     from enact_dist.verify.simulation.model import Model
     from enact_dist.verify.simulation.picture import Picture
     from enact_dist.verify.simulation.shard_host import ShardHost

@@ -87,8 +87,8 @@ def test_ports_of_a_run_are_kept_while_it_runs(tmp_path, monkeypatch):
 
 def test_shipped_cell_fits_together():
     """No two actors write one slot, every trigger is written, every option can be read."""
-    from enact_dist.actor_check import check_cell
-    from enact_dist.config import load_config
+    from enact_dist.actor.check import check_cell
+    from enact_dist.config.read import load_config
 
     assert [f.text for f in check_cell(load_config(TEMPLATE)) if f.level == "error"] == []
 

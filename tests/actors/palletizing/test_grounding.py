@@ -10,6 +10,7 @@ from actors.geometry.kinematics import tool_poses
 from actors.geometry.reaching import reach
 from actors.palletizing.grounding import (
     FOLDER,
+    BESIDE_M,
     SKELETONS,
     Grasp,
     Gripper,

@@ -18,8 +18,8 @@ from actors.palletizing.demo_robot_cell import TEMPLATE, configured
 from actors.palletizing.feedback import HandlingFeedback
 from actors.palletizing.simulation.cell_scene import CellLayout
 from enact_dist import Lock, View, Write, testing
-from enact_dist.actor_check import check_cell
-from enact_dist.config import load_config
+from enact_dist.actor.check import check_cell
+from enact_dist.config.read import load_config
 
 from .handled_cell import (
     ARM,

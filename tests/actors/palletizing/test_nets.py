@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from actors.palletizing.net_files import net_of_text, read_net, text_of_net, write_net
 from actors.palletizing.nets import Axis, Execution, Net, NetError, TaskFrame, TraceStep
 from enact_dist import Aspect, Entity, Lock, Read, Write
-from enact_dist.connecting import local
+from enact_dist.world.connecting import local
 
 from .sound_nets import as_plain, axes, net, primitive, sound_nets, way
 

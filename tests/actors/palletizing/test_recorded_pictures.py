@@ -9,8 +9,8 @@ import actors.palletizing as application
 from actors.geometry.shapes import VGA, Acquisition, DepthFrame, PointCloud, Surface
 from actors.palletizing import vocabulary
 from actors.palletizing.vocabulary import Observation, Plan, Sighting, Viewpoint
-from enact_dist.config import load_config
-from enact_dist.core.datum import Slot
+from enact_dist.config.read import load_config
+from enact_dist.core.protocol.datum import Slot
 from enact_dist.recording.exact import Recorded
 from enact_dist.recording.pictures import pictures_of
 from enact_dist.wire.payload import encode_datum

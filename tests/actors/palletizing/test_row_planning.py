@@ -23,6 +23,7 @@ from .handled_cell import (
     come,
     each,
     packed,
+    executed,
     planned,
     read,
     write,

@@ -26,8 +26,8 @@ from actors.workcell.simulation.room import cameras
 from actors.workcell.simulation.sources import LiveSource
 from actors.workcell.trace import ASPECTS, ONLINE, RECORDED, TRUTH, Kept, Trace
 from enact_dist import Lock, View, Write, testing
-from enact_dist.actor_load import configured_actor
-from enact_dist.config import load_config
+from enact_dist.actor.running.load import configured_actor
+from enact_dist.config.read import load_config
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from actors.workcell.sources import CameraSource
     from actors.workcell.vocabulary import ArmModel, Calibration
     from enact_dist import Actor, Cell
-    from enact_dist.config_types import ActorConfig
+    from enact_dist.config.types import ActorConfig
 
 TICK_S: Final = words.PERIOD_S
 SCALE: Final = 0.5

@@ -43,9 +43,9 @@ from actors.workcell.simulation.truth import TruthHuman
 from actors.workcell.trace import ASPECTS, trace_of
 from actors.workcell.unshared import PlainEach, PlainLock, Version
 from enact_dist import Aspect, Entity, Lock, View, Write, local, testing
-from enact_dist.actor_check import check_cell, declarations_of
-from enact_dist.actor_words import ACTOR, WORDS
-from enact_dist.config import load_config
+from enact_dist.actor.check import check_cell, declarations_of
+from enact_dist.actor.running.words import ACTOR, WORDS
+from enact_dist.config.read import load_config
 from enact_dist.errors import ConfigError, MisuseError
 
 NOTE = Aspect("note", str)
@@ -100,8 +100,8 @@ def test_cell_of_a_run_differs_only_in_what_a_run_chooses(tmp_path):
 @pytest.mark.parametrize("separate", [False, True])
 def test_both_layouts_of_the_cameras_fit_together(tmp_path, separate):
     """A smart camera stands in for three actors; what else there is, is the same."""
-    from enact_dist.actor_check import check_cell
-    from enact_dist.config import load_config
+    from enact_dist.actor.check import check_cell
+    from enact_dist.config.read import load_config
 
     config = configured(TEMPLATE.read_text(), Options(tmp_path, separate=separate))
     (tmp_path / "cell.toml").write_text(toml_of(config))

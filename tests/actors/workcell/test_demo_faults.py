@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from enact_dist import Cell
-    from enact_dist.cell_info import ActorInfo, LockInfo
+    from enact_dist.world.listings import ActorInfo, LockInfo
 
 pytestmark = pytest.mark.timing
 

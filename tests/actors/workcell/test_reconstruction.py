@@ -37,7 +37,7 @@ from actors.workcell.vocabulary import (
     obstacle_entity,
 )
 from enact_dist import Lock, View, Write, testing
-from enact_dist.actor_load import make_actor
+from enact_dist.actor.running.load import make_actor
 from enact_dist.errors import ConfigError
 
 pytest.importorskip("cv2", exc_type=ImportError)

@@ -23,7 +23,7 @@ from . import stepped as stepping
 from .stepped import stepped
 
 if TYPE_CHECKING:
-    from enact_dist.world import WorldContext
+    from enact_dist.world.context import WorldContext
 
     from .stepped import Stepped
 

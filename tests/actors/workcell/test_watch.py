@@ -14,7 +14,7 @@ from actors.workcell.vocabulary import (
 )
 from actors.workcell.watch import CameraWatch, StandIn
 from enact_dist import Lock, View, Write, testing
-from enact_dist.actor_load import make_actor
+from enact_dist.actor.running.load import make_actor
 
 PERIOD_NS = 100_000_000
 WIDTH, HEIGHT = 36, 20

@@ -28,9 +28,9 @@ MEMORY_BYTES_MAX = 16 << 20
 """How much memory it may take at most while it does."""
 WATCHED = (
     "enact_dist/wire/",
-    "enact_dist/link/store_",
-    "enact_dist/link/wal_check",
-    "actor_report",
+    "enact_dist/link/store/",
+    "enact_dist/link/folder/",
+    "enact_dist/actor/report",
 )
 
 NUMBERS = (

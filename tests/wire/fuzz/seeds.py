@@ -14,13 +14,13 @@ import numpy as np
 from fuzz.targets import TYPES, Even, Part, Scan, Side, datum_input, join, packed, row_input
 from wire_samples import CLASSES, sample
 
-from enact_dist.actor_report import ActorStatistics, encode_reports
-from enact_dist.core.datum import Datum
-from enact_dist.core.messages import SlotVersion
-from enact_dist.core.records import Persist, SlotRecord
-from enact_dist.link.store import open_store
-from enact_dist.link.store_mark import MARK_FILE
-from enact_dist.link.store_rows import Kind
+from enact_dist.actor.report import ActorStatistics, encode_reports
+from enact_dist.core.protocol.datum import Datum
+from enact_dist.core.protocol.messages import SlotVersion
+from enact_dist.core.protocol.records import Persist, SlotRecord
+from enact_dist.link.folder.mark import MARK_FILE
+from enact_dist.link.store.rows import Kind
+from enact_dist.link.store.store import open_store
 from enact_dist.terms import Durability
 from enact_dist.wire import keys
 from enact_dist.wire.frames import encode_frame
@@ -143,7 +143,7 @@ def _records(rng: random.Random) -> Iterator[object]:
     """Yield records that leave a row of every kind: ends of others, which leave none, come first."""
     from typing import get_args
 
-    from enact_dist.core import records
+    from enact_dist.core.protocol import records
 
     kinds = get_args(records.Record)
     ends = ("Ended", "Done", "Dropped", "Forgotten")

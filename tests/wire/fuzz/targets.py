@@ -19,15 +19,15 @@ import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
-from enact_dist import actor_report
-from enact_dist.core.datum import Datum
+from enact_dist.actor import report as actor_report
+from enact_dist.core.protocol.datum import Datum
 from enact_dist.errors import DatumTypeError, ProtocolError, StoreError
-from enact_dist.link.blobs import Blob
-from enact_dist.link.store_database import DatabaseRow
-from enact_dist.link.store_mark import MARK_FILE, read_mark
-from enact_dist.link.store_recovery import put_together, read_contents
-from enact_dist.link.store_rows import Key, Kind, row_checksum
-from enact_dist.link.wal_check import check_wal
+from enact_dist.link.folder.blobs import Blob
+from enact_dist.link.folder.mark import MARK_FILE, read_mark
+from enact_dist.link.folder.wal_check import check_wal
+from enact_dist.link.store.database import DatabaseRow
+from enact_dist.link.store.recovery import put_together, read_contents
+from enact_dist.link.store.rows import Key, Kind, row_checksum
 from enact_dist.wire import keys
 from enact_dist.wire.codecs import register_codec
 from enact_dist.wire.frames import decode_frame, encode_frame

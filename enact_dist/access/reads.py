@@ -1,0 +1,480 @@
+"""Data that a lock or a view has named: found by request, fetched and decoded on first use.
+
+`Readings` is the part that `Lock` and `Snapshot` share.  A datum is decoded once; arrays in it are
+read-only views of the received bytes.
+
+Detects data that a block changes in place, which its commit would miss.
+
+What a commit publishes is what was assigned.  Arrays are read-only, so that numpy says so at once;
+a list or dict can be changed all the same, also one inside a dataclass.  So what a block has looked
+at of such data, and might have written, is compared with its bytes before the commit.  Numbers,
+texts and arrays cost nothing: they are not remembered.  Nor is what has a value of a codec in it:
+a codec may write the same value in other bytes each time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import ItemsView, Iterator, Mapping, ValuesView
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
+
+import numpy as np
+
+from enact_dist.config.table import suggestion
+from enact_dist.core.protocol.datum import Datum, Slot
+from enact_dist.core.protocol.messages import DatumRead
+from enact_dist.errors import (
+    DatumTypeError,
+    LockReleasedError,
+    MisuseError,
+    NotRequestedError,
+    NullDatumError,
+)
+from enact_dist.link.client.fetch import fetch_all
+from enact_dist.patterns import pattern_matches
+from enact_dist.terms import Access, Aspect, Entity, LockRequest, NullReason
+from enact_dist.wire import codecs
+from enact_dist.wire.payload import decode_datum, encode_parts
+from enact_dist.wire.shapes import (
+    CodecOf,
+    DictOf,
+    ListOf,
+    OptionalOf,
+    Plain,
+    RecordOf,
+    TupleOf,
+    shape_of,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+
+    from enact_dist.core.client.plan import Reading
+    from enact_dist.core.protocol.datum import Datum, LockId, Slot
+    from enact_dist.core.protocol.messages import SlotState
+    from enact_dist.link.client.fetch import DatumCache
+    from enact_dist.link.client.locks import CellClient
+    from enact_dist.terms import LockRequest
+    from enact_dist.wire.payload import Encoded
+    from enact_dist.wire.shapes import Shape
+
+NAMED_MAX: Final = 4
+"""So many slots are named in one error."""
+
+_changeable: dict[Any, bool] = {}
+codecs.changed.append(_changeable.clear)
+
+
+class Shown(NamedTuple):
+    """A value that a block received, and its datum."""
+
+    value: Any
+    datum: Datum
+    datum_type: Any
+
+
+def changeable(datum_type: Any) -> bool:
+    """Whether a value of this type can be changed in place: it is, or has, a list or dict."""
+    known = _changeable.get(datum_type)
+    if known is None:
+        parts = list(_parts(shape_of(datum_type)))
+        known = any(map(_is_container, parts)) and not any(
+            isinstance(part, CodecOf) for part in parts
+        )
+        _changeable[datum_type] = known
+    return known
+
+
+def _is_container(shape: Shape) -> bool:
+    if isinstance(shape, Plain):
+        return shape.kind in (list, dict, object)
+    return isinstance(shape, ListOf | DictOf)
+
+
+def _parts(shape: Shape) -> Iterator[Shape]:
+    """Yield a shape and all that it is made of."""
+    yield shape
+    match shape:
+        case ListOf(inner) | DictOf(_, inner) | OptionalOf(inner):
+            yield from _parts(inner)
+        case TupleOf(parts, _):
+            for part in parts:
+                yield from _parts(part)
+        case RecordOf(_, fields):
+            for _, part in fields:
+                yield from _parts(part)
+
+
+def refuse_changed(
+    shown: Mapping[Slot, Shown],
+    assigned: Mapping[Slot, Shown],
+    written: Mapping[Slot, Datum | None],
+    requests: Collection[LockRequest[Any]],
+) -> None:
+    """Raise `MisuseError` if what a block could have written was changed and not assigned.
+
+    Args:
+        shown: What the block has looked at, as it was granted.
+        assigned: What it has looked at of its own writes, since it wrote them.
+        written: What it sets.
+        requests: Those of the lock.
+    """
+    looked_at = {slot: one for slot, one in shown.items() if slot not in written} | {**assigned}
+    if not looked_at:
+        return
+    single = {one.address: one for one in requests if one.access.writes and not one.access.each}
+    each = [one for one in requests if one.access.writes and one.access.each]
+    changed = {}
+    for slot, one in looked_at.items():
+        request = single.get(slot) or _allowing(each, slot)
+        if request is not None and _was_changed(one):
+            changed[slot] = request
+    if changed:
+        slot, request = next(iter(changed.items()))
+        names = [f"{slot.entity}/{slot.aspect} in {slot.context}" for slot in changed]
+        more = f" and {len(names) - NAMED_MAX} more" if len(names) > NAMED_MAX else ""
+        at = f"lock[{request!r}]"
+        if request.access is Access.WRITE_EACH:
+            at += f"[Entity({slot.entity!r})]"
+        raise MisuseError(
+            f"{', '.join(names[:NAMED_MAX])}{more} was changed in place, which publishes nothing;"
+            f" nothing was written: change the value, then assign it: {at} = value"
+        )
+
+
+def _allowing(each: Iterable[LockRequest[Any]], slot: Slot) -> LockRequest[Any] | None:
+    """Return the pattern that allows to write a slot, None where none does."""
+    for request in each:
+        context, pattern, aspect = request.address
+        if (context, aspect) == (slot.context, slot.aspect) and pattern_matches(
+            pattern, slot.entity
+        ):
+            return request
+    return None
+
+
+def _was_changed(shown: Shown) -> bool:
+    """Whether a value is another one than its datum's."""
+    now = _encoded(shown.value, shown.datum_type)
+    datum = shown.datum
+    if now is not None and not now.size and not datum.size and now.encoding == datum.encoding:
+        return False
+    # Not with its bytes themselves, which another release may have written in another way.
+    before = _encoded(decode_datum(datum, shown.datum_type), shown.datum_type)
+    if now is None or before is None:
+        return before is not None
+    if now.encoding != before.encoding or len(now.parts) != len(before.parts):
+        return True
+    return not all(map(_same_bytes, now.parts, before.parts))
+
+
+def _encoded(value: object, datum_type: Any) -> Encoded | None:
+    """Return a value's bytes; None where it is no datum (any more)."""
+    try:
+        return encode_parts(value, datum_type)
+    except DatumTypeError:
+        return None
+
+
+def _same_bytes(left: Any, right: Any) -> bool:
+    """Whether two parts are the same; arrays over the same memory are not gone through."""
+    one, other = np.frombuffer(left, np.uint8), np.frombuffer(right, np.uint8)
+    same_place = one.ctypes.data == other.ctypes.data and one.size == other.size
+    return same_place or np.array_equal(one, other)
+
+
+T = TypeVar("T")
+
+UNSET: Any = object()
+_slot_at: Final = partial(tuple.__new__, Slot)
+_read_of: Final = partial(tuple.__new__, DatumRead)
+"""Make them of parts that were looked at before, in a third of the time."""
+AHEAD_BYTES_MAX: Final = 64 << 20
+"""Bytes that are fetched before the data are individually requested."""
+
+
+class Readings:
+    """The states that a grant or view showed, by slot.
+
+    Args:
+        client: The session they came by.
+        cache: Where fetched data are kept by version.
+        lock: The lock or view that pins them.
+        readings: The states.
+        usable: Raises if the lock is over or lost; called before every access.
+
+    Attributes:
+        decoded: How many data were decoded so far.
+        looked_at: Those that are here still.
+        changeable: Of these the ones that can be changed in place, with their bytes.
+        asked: The requests they were asked for with, where not all may be read.
+    """
+
+    def __init__(
+        self,
+        client: CellClient,
+        cache: DatumCache,
+        lock: LockId,
+        readings: Iterable[Reading],
+        usable: Callable[[], None],
+    ) -> None:
+        self._client = client
+        self._cache = cache
+        self._lock = lock
+        self._readings: dict[Slot, Reading] = {}
+        for reading in readings:
+            self._readings[reading.state.slot] = reading
+        self.looked_at: dict[Slot, Any] = {}
+        self.changeable: dict[Slot, Shown] = {}
+        self._kept: dict[Slot, Datum] = {}
+        self._fetched_alone = 0
+        self.asked: Iterable[LockRequest[Any]] = ()
+        self.usable = usable
+        self.decoded = 0
+
+    def end(self) -> None:
+        """Forget all data: the lock is over, as every later look at them says."""
+        self.usable = partial(_refuse_released, self.asked)
+        self._readings.clear()
+        self.looked_at.clear()
+        self.changeable.clear()
+        self._kept.clear()
+
+    def state(self, slot: Slot) -> SlotState | None:
+        """Return the state of a slot, or None if it was not shown (a pattern, and null)."""
+        reading = self._readings.get(slot)
+        return reading.state if reading is not None else None
+
+    def shown(self) -> Iterator[tuple[str, SlotState]]:
+        """Yield every state that is not null, with the shard that showed it."""
+        for reading in self._readings.values():
+            if not is_null(reading.state):
+                yield reading.shard, reading.state
+
+    def versions(self, slots: Iterable[Slot]) -> tuple[DatumRead, ...]:
+        """Return which version of each of these slots was shown, of those that were."""
+        found = map(self._readings.get, slots)
+        return tuple([_read_of(reading.state[:3]) for reading in found if reading is not None])
+
+    def shard(self, slot: Slot) -> str:
+        """Return the shard that showed the slot."""
+        return self._readings[slot].shard
+
+    def datum(self, slot: Slot) -> Datum:
+        """Return the encoded datum of a slot that is not null, fetching it where needed."""
+        kept = self._kept.get(slot)
+        if kept is not None:
+            return kept
+        shard, epoch, state = self._readings[slot]
+        if state.datum is not None and not state.large:
+            self._cache.put(slot, shard, epoch, state.version, state.datum)
+            return state.datum
+        if not self._is_to_come(slot):
+            return self._fetched([slot])[slot]
+        self._fetched_alone += 1
+        others = self._asked_alone() if self._fetched_alone > 1 else []
+        # A program that has read two of them is likely to read the others, too.
+        self.fetch(ahead(slot, others, self.bytes_to_come) if slot in others else [slot])
+        return self._kept[slot]
+
+    def _asked_alone(self) -> list[Slot]:
+        """Return the slots that the lock's requests name one by one, to be read."""
+        reads = (Access.READ, Access.VIEW)
+        return [slot_of(request) for request in self.asked if request.access in reads]
+
+    def fetch(self, slots: Iterable[Slot]) -> None:
+        """Fetch those of these data that are not here, all at once, and keep them."""
+        to_come = [slot for slot in slots if self._is_to_come(slot)]
+        if to_come:
+            self._kept.update(self._fetched(to_come))
+
+    def _fetched(self, slots: Iterable[Slot]) -> dict[Slot, Datum]:
+        readings = [self._readings[slot] for slot in slots]
+        return fetch_all(self._client, self._cache, self._lock, readings, self.usable)
+
+    def bytes_to_come(self, slot: Slot) -> int:
+        """Return how long a datum is that would have to be fetched, 0 for all others."""
+        return self._readings[slot].state.size if self._is_to_come(slot) else 0
+
+    def _is_to_come(self, slot: Slot) -> bool:
+        reading = self._readings.get(slot)
+        return reading is not None and reading.state.large and slot not in self._kept
+
+    def keep_all(self) -> None:
+        """Fetch all data now, so that they can be read after the lock or view is over."""
+        states = (reading.state for reading in self._readings.values())
+        named = [state.slot for state in states if state.large or state.same]
+        self._kept.update(self._fetched(named))
+
+    def value(self, slot: Slot, aspect: Aspect[T]) -> T:
+        """Return the decoded datum of a slot; the caller has made sure that it is `usable`.
+
+        Raises:
+            NullDatumError: The slot is null.
+        """
+        value: T = self.looked_at.get(slot, UNSET)
+        if value is UNSET:
+            reading = self._readings.get(slot)
+            if reading is None or reading.state.null_reason:
+                raise self.null_error(slot)
+            datum, datum_type = self.datum(slot), aspect.datum_type
+            try:
+                value = decode_datum(datum, datum_type)
+            except DatumTypeError as error:
+                raise misfit(slot, "cannot be read", error) from error.__cause__
+            self.looked_at[slot] = value
+            self.decoded += 1
+            if changeable(datum_type):
+                self.changeable[slot] = Shown(value, datum, datum_type)
+        return value
+
+    def null_error(self, slot: Slot) -> NullDatumError:
+        """Return the error for reading a slot that was null or not shown."""
+        return null_error(slot, self.state(slot), self._client.aspect_entries())
+
+    def readings(self) -> Iterable[Reading]:
+        """Return what was shown of every slot."""
+        return self._readings.values()
+
+    def matching(self, request: LockRequest[Any]) -> list[Slot]:
+        """Return the slots of a pattern request that are not null, in order of their names."""
+        context, pattern, aspect = request.address
+        return sorted(
+            slot
+            for slot, reading in self._readings.items()
+            if slot.context == context
+            and slot.aspect == aspect
+            and not is_null(reading.state)
+            and pattern_matches(pattern, slot.entity)
+        )
+
+
+def ahead(first: Slot, others: Iterable[Slot], bytes_of: Callable[[Slot], int]) -> list[Slot]:
+    """Return `first` and as many of the others as may be fetched with it."""
+    found, size = [first], bytes_of(first)
+    for slot in others:
+        if slot != first:
+            size += bytes_of(slot)
+            if size > AHEAD_BYTES_MAX:
+                break
+            found.append(slot)
+    return found
+
+
+def is_null(state: SlotState) -> bool:
+    """Whether the slot holds no datum."""
+    return bool(state.null_reason)
+
+
+def null_error(
+    slot: Slot, state: SlotState | None, aspects: Collection[str] | None = None
+) -> NullDatumError:
+    """Return the error for reading a null slot, with the reason.
+
+    Args:
+        slot: The slot.
+        state: What was shown of it.
+        aspects: Those that the cell knows; None where that is of no matter.
+    """
+    reason = NullReason[state.null_reason].value if state else NullReason.NEVER_SET.value
+    unknown = ""
+    if aspects is not None and slot.aspect not in aspects:
+        unknown = f"; no shard knows an aspect {slot.aspect!r}{suggestion(slot.aspect, aspects)}"
+    return NullDatumError(
+        f"{slot.entity}/{slot.aspect} is null in {slot.context} ({reason}{unknown});"
+        " use .get(request, default) where that is expected",
+        reason=reason,
+    )
+
+
+def misfit(slot: Slot, what: str, error: DatumTypeError) -> DatumTypeError:
+    """Return the error for a datum of another type, with the slot that it is in."""
+    return DatumTypeError(f"{slot.context}:{slot.entity}/{slot.aspect} {what}: {error}")
+
+
+def slot_of(request: LockRequest[Any]) -> Slot:
+    """Return the slot that a request for one entity names."""
+    return _slot_at(request.address)
+
+
+class EachData(Mapping[Entity, T]):
+    """The data of a pattern request by entity; decoded when they are looked at.
+
+    A single look-up fetches one datum.  An iteration, by `values()` or otherwise, fetches those
+    that follow as well.
+    """
+
+    def __init__(self, readings: Readings, request: LockRequest[T]) -> None:
+        self._data = readings
+        self._request = request
+        self._slots = {Entity(slot.entity): slot for slot in readings.matching(request)}
+        self._next = -1
+
+    def __getitem__(self, entity: Entity) -> T:
+        slot = self._slots.get(entity)
+        if slot is None:
+            raise KeyError(entity)
+        self._data.usable()
+        if self._data.bytes_to_come(slot):
+            self._fetch(slot)
+        return self._data.value(slot, self._request.aspect)
+
+    def __contains__(self, entity: object) -> bool:
+        """Say whether there is a datum, without looking at it."""
+        return entity in self._slots
+
+    def _fetch(self, slot: Slot) -> None:
+        """Fetch a datum, and those behind it where the one before it was fetched last."""
+        order = list(self._slots.values())
+        at, to_come = order.index(slot), self._data.bytes_to_come
+        in_order = 0 <= self._next <= at and not any(map(to_come, order[self._next : at]))
+        slots = ahead(slot, order[at + 1 :], to_come) if in_order else [slot]
+        self._data.fetch(slots)
+        self._next = at + len(slots)
+
+    def slots(self) -> Collection[Slot]:
+        """Return the slots that hold the data."""
+        return self._slots.values()
+
+    def values(self) -> ValuesView[T]:
+        """Return the data in the order of their entities; large ones come together."""
+        self._next = 0
+        return super().values()
+
+    def items(self) -> ItemsView[Entity, T]:
+        """Return the entities with their data; large ones come together."""
+        self._next = 0
+        return super().items()
+
+    def __iter__(self) -> Iterator[Entity]:
+        return iter(self._slots)
+
+    def __len__(self) -> int:
+        return len(self._slots)
+
+    def __repr__(self) -> str:
+        return f"<data of {self._request!r}: {len(self)} entities>"
+
+
+def check_requested(
+    request: object, requests: Mapping[LockRequest[Any], LockRequest[Any]], what: str
+) -> None:
+    """Raise unless `request` is one of those that the lock or view was made with.
+
+    Raises:
+        NotRequestedError: The lock does not have this request.
+        MisuseError: It is not a request.
+    """
+    if not isinstance(request, LockRequest):
+        raise MisuseError(
+            f"a {what} is indexed by the request it was made with, not by {request!r}"
+        )
+    if request not in requests:
+        asked = ", ".join(map(repr, requests)) or "nothing"
+        raise NotRequestedError(f"{request!r} was not asked for; this {what} asked for {asked}")
+
+
+def _refuse_released(requests: Iterable[LockRequest[Any]]) -> None:
+    raise LockReleasedError(
+        f"Lock({', '.join(map(repr, requests))}) is used outside its `with` block"
+    )

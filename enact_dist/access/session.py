@@ -1,0 +1,361 @@
+"""What a cell's handles share: the client, the datum cache, names turned into protocol items."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any, Final
+
+from enact_dist.access.asking import await_stamp
+from enact_dist.access.reads import slot_of
+from enact_dist.access.together import Together
+from enact_dist.config.table import suggestion
+from enact_dist.core.protocol.datum_types import type_conflict
+from enact_dist.core.protocol.messages import AspectEntry, Item
+from enact_dist.core.protocol.placement import shard_of
+from enact_dist.core.state.retention import said
+from enact_dist.errors import (
+    DatumTypeError,
+    MisuseError,
+    ShardUnreachableError,
+    UnknownWorldError,
+)
+from enact_dist.link.client.calls import CALL_S
+from enact_dist.link.client.fetch import DatumCache
+from enact_dist.retention import checked_retention
+from enact_dist.terms import Entity, LockRequest
+from enact_dist.wire.fingerprint import fingerprint
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+
+    from enact_dist.core.client.plan import Reading
+    from enact_dist.core.protocol.datum import Slot
+    from enact_dist.link.client.locks import CellClient
+    from enact_dist.terms import Aspect
+
+
+SETTLE_S: Final = 10.0
+"""How long our own commit may take to be shown by all its shards."""
+SETTLE_SLICE_S: Final = 0.5
+ENTRIES_MAX: Final = 1024
+"""Aspect objects whose catalogue entries are remembered."""
+LOOKED_UP_S: Final = 1.0
+"""So long the shards are not asked again about an aspect that is only read and not in use yet."""
+
+
+class Session:
+    """One connection of this process to a cell, behind `Cell`, `WorldContext` and `Lock`."""
+
+    def __init__(self, client: CellClient) -> None:
+        self.client = client
+        self.cache = DatumCache()
+        self._entries: dict[int, tuple[Aspect[Any], AspectEntry, AspectEntry]] = {}
+        self._looked_up: dict[AspectEntry, float] = {}
+        self._lapses = 0
+        self._unknown: set[AspectEntry] = set()
+
+    def prepare(self, requests: Iterable[LockRequest[Any]], *, wait_s: float | None = None) -> int:
+        """Make sure that the aspects of a lock or view can be used: register what it may write.
+
+        Args:
+            requests: The requests; only their shards are asked.
+            wait_s: How long the caller would wait at most; each shard gets at least the time of
+                one call.
+
+        Returns:
+            The value to pass to `check_shown` once a grant or view has arrived.
+
+        Raises:
+            DatumTypeError: A shard knows one of the aspects with another type.
+            ShardUnreachableError: A shard that is asked does not answer.
+        """
+        prepared = self._see_lapses()
+        written: set[str] = set()
+        aspects: dict[str, Aspect[Any]] = {}
+        entries: list[AspectEntry] = []
+        for request in requests:
+            aspects[request.aspect.name] = request.aspect
+            if request.access.writes:
+                written.add(request.aspect.name)
+        for name, aspect in aspects.items():
+            entries.append(self._entry(aspect, reads=name not in written))
+        if self.client.knows(entries):
+            return prepared
+        patience_s = self.client.patience_s
+        timeout_s = patience_s if wait_s is None else min(patience_s, max(wait_s, CALL_S))
+        if written:
+            writing = [request for request in requests if request.access.writes]
+            self.client.register(
+                aspects=[entry for entry in entries if entry.name in written],
+                needed=lambda: self.shards_of(writing),
+                timeout_s=timeout_s,
+            )
+        reading = [request for request in requests if request.aspect.name not in written]
+        if reading:
+            read = [entry for entry in entries if entry.name not in written]
+            self._look_up(read, lambda: self.shards_of(reading), timeout_s)
+        return prepared
+
+    def _see_lapses(self) -> int:
+        """Return how often a shard has forgotten an aspect; what was looked up before is void."""
+        lapses = self.client.lapses
+        if lapses != self._lapses:
+            self._lapses = lapses
+            self._looked_up.clear()
+        return lapses
+
+    def greet(self, *, enough: str = "") -> None:
+        """Refresh the aspects and world contexts that the shards know.
+
+        With the name of an aspect that is `enough` it ends where those that answer at once know it.
+
+        Raises:
+            ShardUnreachableError: A shard does not answer.
+        """
+        client = self.client
+        if enough:
+            client.call_once([(shard, client.core.hello(shard)) for shard in client.shards()])
+            found = client.aspect_entries().get(enough)
+            if found is not None and found.fingerprint:
+                return
+        client.greet()
+
+    def look_up(self, aspects: Iterable[Aspect[Any]], *, timeout_s: float | None = None) -> None:
+        """Make sure that no shard knows one of these aspects, which are only read, otherwise.
+
+        Args:
+            aspects: The aspects.
+            timeout_s: How long shards have to answer; None: as long as this client has patience.
+
+        Raises:
+            DatumTypeError: A shard knows one with another type.
+            ShardUnreachableError: A shard that is asked does not answer.
+        """
+        self._see_lapses()
+        entries = [self._entry(aspect, reads=True) for aspect in aspects]
+        if not self.client.knows(entries):
+            self._look_up(entries, self.client.shards, timeout_s)
+
+    def _look_up(
+        self,
+        entries: Sequence[AspectEntry],
+        needed: Callable[[], Iterable[str]],
+        timeout_s: float | None,
+    ) -> None:
+        """Check aspects that are only read; nothing comes to be by being asked for.
+
+        A reader of a known aspect may want more retention, and the aspect may be new to some
+        shard: these are registered too, except by an observer.
+        """
+        client, now_s = self.client, time.monotonic()
+        due = [e for e in entries if now_s >= self._looked_up.get(e, -LOOKED_UP_S) + LOOKED_UP_S]
+        lacking = client.lacking(due, needed)
+        if not lacking:
+            self._unknown.difference_update(due)
+            return
+        client.greet(lacking, timeout_s=timeout_s)
+        known = client.aspect_entries()
+        for entry in due:
+            wrong = type_conflict(known[entry.name], entry) if entry.name in known else ""
+            if wrong:
+                raise DatumTypeError(wrong)
+        used = [entry for entry in due if entry.name in known]
+        if used and not client.core.observer:
+            # A shard to which an aspect is new gets the type that the others have.
+            as_known = [one._replace(fingerprint=known[one.name].fingerprint) for one in used]
+            client.register(aspects=as_known, needed=needed, timeout_s=timeout_s)
+        if len(self._looked_up) >= ENTRIES_MAX:
+            self._looked_up.clear()
+            self._unknown.clear()
+        self._looked_up.update(dict.fromkeys(due, now_s))
+        self._unknown -= set(used)
+        self._unknown |= set(due) - set(used)
+
+    def check_shown(
+        self, readings: Iterable[Reading], requests: Iterable[LockRequest[Any]], prepared: int
+    ) -> None:
+        """Check aspects that came into use after they were looked up, by what is shown of them.
+
+        Checks only the aspects of these requests, at the shards that show them.  If a shard has
+        forgotten an aspect or changed its type in between, all are checked again.
+
+        Args:
+            readings: What is shown.
+            requests: What was asked for.
+            prepared: What `prepare` has returned.
+
+        Raises:
+            DatumTypeError: One has another type.
+            ShardUnreachableError: A shard does not answer.
+        """
+        if self.client.lapses != prepared:
+            self.prepare(requests, wait_s=CALL_S)
+        if not self._unknown:
+            return  # the usual case
+        shown = [one.state.slot for one in readings if not one.state.null_reason]
+        names = {slot.aspect for slot in shown}
+        wanted = {
+            self._entry(one.aspect, reads=True) for one in requests if one.aspect.name in names
+        }
+        entries = [entry for entry in wanted if entry in self._unknown]
+        for entry in entries:
+            self._looked_up.pop(entry, None)
+            self._unknown.discard(entry)  # whatever comes out, it is not unknown any more
+        if entries:
+            new = {entry.name for entry in entries}
+            placement = self.client.core.placement
+            shards = {shard_of(slot.entity, placement) for slot in shown if slot.aspect in new}
+            self._look_up(entries, lambda: shards, CALL_S)
+
+    def shards_of(self, requests: Iterable[LockRequest[Any]]) -> set[str]:
+        """Return the shards on which the requests lie; a pattern lies on all."""
+        shards: set[str] = set()
+        for request in requests:
+            if request.access.each:
+                return set(self.client.shards())
+            shards.add(shard_of(str(request.entity), self.client.core.placement))
+        return shards
+
+    def _entry(self, aspect: Aspect[Any], *, reads: bool = False) -> AspectEntry:
+        """Return the entry with which a client registers; computed once per aspect object."""
+        known = self._entries.get(id(aspect))
+        if known is None or known[0] is not aspect:
+            if len(self._entries) >= ENTRIES_MAX:
+                self._entries.clear()  # for programs that make a new aspect for each lock
+            durability = aspect.durability.value if aspect.durability is not None else ""
+            entry = AspectEntry(
+                aspect.name,
+                fingerprint(aspect.datum_type),
+                durability,
+                *said(checked_retention(aspect.retention)),
+            )
+            known = (aspect, entry, entry._replace(reads=True))
+            self._entries[id(aspect)] = known
+        _, writing, reading = known
+        return reading if reads else writing
+
+    def aspect_used(self, name: str) -> Aspect[Any] | None:
+        """Return the aspect of that name that this process used last here, if it used one."""
+        entries = list(self._entries.values())  # other threads add to them
+        return next((aspect for aspect, *_ in reversed(entries) if aspect.name == name), None)
+
+    def shard_of(self, slot: Slot) -> str:
+        """Return the name of the shard that owns the slot."""
+        return shard_of(slot.entity, self.client.core.placement)
+
+    def item_of(
+        self, request: LockRequest[Any], captured_ns: int = 0, *, nearest: bool = False
+    ) -> Item:
+        """Return the protocol's line for a request, with the version that the cache holds.
+
+        With `captured_ns` it asks for the version with that capture stamp, or the `nearest`.
+        """
+        context, entity, aspect = request.address
+        if request.access.each:
+            return Item(int(request.access), context, entity, aspect)
+        slot, known = slot_of(request), 0
+        if slot in self.cache:
+            shard = self.shard_of(slot)
+            known = self.cache.version(slot, shard, self.client.core.epoch(shard))
+        return Item(int(request.access), context, entity, aspect, known, captured_ns, nearest)
+
+    def settle(self, shard: str) -> None:
+        """Wait until a shard shows our own commits over shards, which may be on their way to it.
+
+        Raises:
+            ShardUnreachableError: It does not in time.
+        """
+        stamp_ns = self.client.unsettled_ns(shard)
+        deadline_s = time.monotonic() + SETTLE_S
+        while stamp_ns:
+            if await_stamp(self.client, shard, stamp_ns, wait_s=SETTLE_SLICE_S):
+                self.client.reached(shard, stamp_ns)
+                return
+            if time.monotonic() >= deadline_s:
+                raise ShardUnreachableError(
+                    f"shard {shard} does not show a commit of this process after {SETTLE_S:g} s:"
+                    " the shard that decided it is away; see `enact lock ls`",
+                    shard=shard,
+                )
+
+    def check_world(self, name: str) -> None:
+        """Make sure that the cell has a world context: where a listing came back empty.
+
+        Raises:
+            UnknownWorldError: Not every shard has it (any more).
+            ShardUnreachableError: A shard does not answer.
+        """
+        self.client.greet()
+        if name not in self.client.worlds():
+            raise self.unknown_world(name)
+
+    def unknown_world(self, name: str) -> UnknownWorldError:
+        """Return the error for a world context that the cell does not have."""
+        known = tuple(self.client.worlds())
+        part = self.client.worlds_at(name)
+        remedy = f"enact world create {name}, or cell.create_world({name!r}), makes it"
+        if part:
+            remedy = (
+                f"a part of it is on {', '.join(part)} alone: complete the fork, or drop it with"
+                f" enact world drop {name}, or cell.drop_world({name!r})"
+            )
+        return UnknownWorldError(
+            f"the cell has no world context {name!r}{suggestion(name, known)} (it has"
+            f" {', '.join(known) or 'none'}); {remedy}",
+            known=known,
+        )
+
+
+def unknown_aspect(name: str, known: Iterable[str]) -> MisuseError:
+    """Return the error for an aspect that no program has registered."""
+    names = sorted(known)
+    return MisuseError(
+        f"no aspect {name!r} is registered{suggestion(name, names)} (known:"
+        f" {', '.join(names) or 'none'})"
+    )
+
+
+def _remedy(request: object) -> str:
+    """Return what to do with what is no lock request."""
+    if isinstance(request, Together):
+        return (
+            "to lock what belongs to a set, make it the trigger of an Actor; to see the newest"
+            " complete set without a lock, world.view(together)"
+        )
+    return "use Read, Write, View or …Each"
+
+
+def session_of(requests: tuple[LockRequest[Any], ...], *, view: bool = False) -> Session:
+    """Return the one cell session that all requests belong to.
+
+    Args:
+        requests: Of a lock, or of a `view`, which may be one of the past.
+        view: Whether they only look.
+
+    Raises:
+        MisuseError: A request names an unbound role, two cells are mixed, or one locks the past.
+    """
+    session: Session | None = None
+    for request in requests:
+        if not isinstance(request, LockRequest):
+            raise MisuseError(f"{request!r} is no lock request; {_remedy(request)}")
+        found: Session | None = getattr(request.world, "session", None)
+        if found is None:
+            raise MisuseError(
+                f"{request!r} names {request.world!r}, which is a role and not a world context of"
+                " a cell; use cell.world(name), or run the actor with its roles bound"
+            )
+        if not request.access.each and not isinstance(request.entity, Entity):
+            raise MisuseError(
+                f"{request!r} names a pattern; outside an actor use {type(request).__name__}Each"
+            )
+        if request.world.past and (request.access.locks or not view):
+            raise MisuseError(
+                f"{request!r} names {request.world!r}: what was cannot be locked; view it with"
+                " past.view(View(past, …)), or name the world context as it is now"
+            )
+        if session is not None and found is not session:
+            raise MisuseError("one lock names world contexts of two connections; connect once")
+        session = found
+    assert session is not None, "called with at least one request"
+    return session

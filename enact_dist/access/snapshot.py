@@ -1,0 +1,298 @@
+"""A view without a lock: taken over all shards as one cut, then read like a lock's data."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final, TypeVar, overload
+
+from enact_dist.access.arguments import Moment, check_argument
+from enact_dist.access.reads import EachData, Readings, check_requested, slot_of
+from enact_dist.access.session import session_of, unknown_aspect
+from enact_dist.access.together import Together, captured_versions
+from enact_dist.core.protocol.messages import Survey, Surveyed
+from enact_dist.errors import LeaseLostError, MisuseError, NullDatumError, ProtocolError
+from enact_dist.terms import Aspect, Entity, NullReason, View
+from enact_dist.wire.limits import ITEMS_MAX
+from enact_dist.wire.payload import decode_untyped
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from enact_dist.access.session import Session
+    from enact_dist.core.protocol.messages import AspectEntry, Item, SlotState
+    from enact_dist.terms import Context, LockRequest, LockRequestEach, LockRequestOne
+
+T = TypeVar("T")
+
+NOW: Final = Moment(0)
+
+VIEW_S = 10.0
+"""How long a view may last."""
+VIEWS_MAX = 3
+"""Retries of a view whose data were removed before they were fetched."""
+
+
+def take_snapshot(
+    asked: tuple[LockRequest[Any] | Together[Any], ...], *, register: bool = True
+) -> Snapshot:
+    """Take a view of the requested data; large data are fetched before this returns."""
+    together, requests = _spread(asked)
+    if not requests:
+        raise MisuseError("a view of nothing: name at least one View or ViewEach")
+    if len(requests) > ITEMS_MAX:
+        raise MisuseError(
+            f"a view with {len(requests)} requests; at most {ITEMS_MAX} are allowed. A ViewEach"
+            " counts as one request and shows all matching data"
+        )
+    session = session_of(requests, view=True)
+    session.client.check_usable()
+    for request in requests:
+        if request.access.locks:
+            raise MisuseError(f"{request!r} locks; view(…) takes View and ViewEach, or use Lock(…)")
+    moment = _moment_of(requests, together)
+    prepared = session.prepare(requests) if register else 0
+    for attempt in range(1, VIEWS_MAX + 1):
+        try:
+            members = _newest_set(session, together) if together is not None else ()
+            captured_ns = min(filter(None, members), default=0)
+            items = _items(session, requests, moment, together, members)
+            readings = take_readings(session, items, past_ns=moment.at_ns)
+            if register:
+                session.check_shown(readings.readings(), requests, prepared)
+            snapshot = Snapshot(readings, requests, together, captured_ns)
+            if together is None or attempt == VIEWS_MAX or snapshot.has_set():
+                return snapshot  # what has left retention just now is null in it
+        except LeaseLostError:
+            # A shard restarted, or the session rested too long, between the view and its data.
+            if attempt == VIEWS_MAX:
+                raise
+    raise AssertionError("a view ends in its data or an error")
+
+
+def _moment_of(requests: tuple[LockRequest[Any], ...], together: Together[Any] | None) -> Moment:
+    """Return the one moment that all requests name.
+
+    Raises:
+        MisuseError: They name several, or a set of the past.
+    """
+    moments: dict[Moment, LockRequest[Any]] = {}
+    for request in requests:
+        moments.setdefault(getattr(request.world, "moment", NOW), request)
+    if len(moments) > 1:
+        raise MisuseError(
+            "one view shows one moment; take views of their own for"
+            f" {' and '.join(repr(request.world) for request in moments.values())}"
+        )
+    (moment,) = moments
+    if together is not None and moment != NOW:
+        raise MisuseError(
+            f"{together!r} asks for the newest set, which is not past; see an older one with"
+            " world.at(stamp_ns=…)"
+        )
+    return moment
+
+
+def _items(
+    session: Session,
+    requests: tuple[LockRequest[Any], ...],
+    moment: Moment,
+    together: Together[Any] | None,
+    members: tuple[int, ...],
+) -> list[Item]:
+    """Return the protocol's lines for all requests; those of a set ask for its capture stamp."""
+    in_set: Mapping[Any, int] = together.stamps(members) if together is not None else {}
+    items: list[Item] = []
+    for request in requests:
+        captured_ns = in_set.get(request, moment.captured_ns)
+        if captured_ns and request.access.each:
+            items += _items_of_each(session, request, moment)
+        else:
+            items.append(session.item_of(request, captured_ns, nearest=moment.nearest))
+    return items
+
+
+def _items_of_each(session: Session, request: LockRequest[Any], moment: Moment) -> Iterator[Item]:
+    """Yield the lines for a pattern by capture stamp, which is asked slot by slot."""
+    context, pattern, aspect = request.address
+    for _, state in survey_states(session, context, pattern, (aspect,)):
+        view = View(request.world, Entity(state.slot.entity), request.aspect)
+        yield session.item_of(view, moment.captured_ns, nearest=moment.nearest)
+
+
+def survey_states(
+    session: Session, context: str, pattern: str, aspects: tuple[str, ...] = ()
+) -> list[tuple[str, SlotState]]:
+    """Return the newest states of matching slots with their shards, without their data.
+
+    Raises:
+        UnknownWorldError: The cell has no such world context.
+        ShardUnreachableError: A shard does not answer.
+    """
+    client = session.client
+    request = Survey((context,), (pattern,), aspects)
+    shards = client.shards()
+    found = []
+    answers = client.call_all([(shard, request) for shard in shards])
+    for shard, answer in zip(shards, answers, strict=True):
+        if not isinstance(answer, Surveyed):
+            raise ProtocolError(f"{type(answer).__name__} came as the answer to Survey")
+        found += [(shard, state) for state in answer.states]
+    if not found:
+        session.check_world(context)
+    return found
+
+
+def _spread(
+    asked: tuple[LockRequest[Any] | Together[Any], ...],
+) -> tuple[Together[Any] | None, tuple[LockRequest[Any], ...]]:
+    """Return the set that is asked for, and all requests, those of the set in its place."""
+    sets = [request for request in asked if isinstance(request, Together)]
+    if len(sets) > 1:
+        raise MisuseError(f"one view shows one set; take {sets[1]!r} in a view of its own")
+    requests: list[LockRequest[Any]] = []
+    for request in asked:
+        requests += request.requests if isinstance(request, Together) else (request,)
+    return (sets[0] if sets else None), tuple(requests)
+
+
+def _newest_set(session: Session, together: Together[Any]) -> tuple[int, ...]:
+    """Return the capture stamps of the data of the newest set that may run; 0 of those missing."""
+    versions = captured_versions(session, together.requests)
+    members = together.newest(versions)
+    if not members:
+        found = "; ".join(
+            f"{slot_of(request)} has {sorted({one.captured_ns for one in each})[-3:] or 'none'}"
+            for request, each in zip(together.requests, versions, strict=True)
+        )
+        raise NullDatumError(
+            f"no capture stamp is common to all {len(versions)} data (newest stamps, 0 is unsaid:"
+            f" {found}); write with lock.put(…, stamp_ns=…), and let the aspects retain as many"
+            " versions as are under way at once",
+            reason=NullReason.OUTSIDE_RETENTION.value,
+        )
+    return members
+
+
+def take_readings(
+    session: Session, items: list[Item], *, past_ns: int = 0, data: bool = True
+) -> Readings:
+    """Take one view, as of a stamp if one is given, and fetch what is large of its `data`."""
+    client = session.client
+    lock = client.acquire(items, wait_s=client.patience_s, hold_s=VIEW_S, past_ns=past_ns)
+    try:
+        readings = Readings(client, session.cache, lock.lock, lock.states, lambda: None)
+        if data:
+            readings.keep_all()
+        client.finish(lock, {})
+    finally:
+        client.release(lock)
+    return readings
+
+
+class Snapshot:
+    """Data as of one view, indexed by the requests it was made with.
+
+    Attributes:
+        captured_ns: The capture stamp of its `Together`, 0 where none was asked for.
+    """
+
+    def __init__(
+        self,
+        readings: Readings,
+        requests: tuple[LockRequest[Any], ...],
+        together: Together[Any] | None = None,
+        captured_ns: int = 0,
+    ) -> None:
+        self._readings = readings
+        self._requests = {request: request for request in requests}
+        self._together = together
+        self.captured_ns = captured_ns
+
+    def has_set(self) -> bool:
+        """Whether so many data of the `Together` are not null as it asks for."""
+        if self._together is None:
+            return True
+        states = [self._readings.state(slot_of(view)) for view in self._together.requests]
+        there = sum(state is not None and not state.null_reason for state in states)
+        return there >= self._together.least
+
+    @overload
+    def __getitem__(self, request: Together[T]) -> tuple[T, ...]: ...
+    @overload
+    def __getitem__(self, request: LockRequestEach[T]) -> Mapping[Entity, T]: ...
+    @overload
+    def __getitem__(self, request: LockRequestOne[T]) -> T: ...
+    def __getitem__(self, request: LockRequest[Any] | Together[Any]) -> Any:
+        """Return the datum; for a pattern, the data by entity; for a set, its data in order.
+
+        Raises:
+            NullDatumError: The world context does not know it.
+            NotRequestedError: The view did not ask for it.
+        """
+        if isinstance(request, Together):
+            whole = request.least == len(request.requests)
+            return tuple(self[one] if whole else self.get(one) for one in request.requests)
+        check_requested(request, self._requests, "view")
+        if request.access.each:
+            return EachData(self._readings, request)
+        return self._readings.value(slot_of(request), request.aspect)
+
+    @overload
+    def get(self, request: LockRequestOne[T]) -> T | None: ...
+    @overload
+    def get(self, request: LockRequestOne[T], default: T) -> T: ...
+    def get(self, request: LockRequestOne[T], default: T | None = None) -> T | None:
+        """Return the datum, or `default` where the world context does not know it."""
+        try:
+            return self[request]
+        except NullDatumError:
+            return default
+
+    def state(self, request: LockRequestOne[Any]) -> SlotState | None:
+        """Return what was shown of a slot; as `version`, for the framework."""
+        check_requested(request, self._requests, "view")
+        return self._readings.state(slot_of(request))
+
+    def version(self, request: LockRequestOne[Any]) -> int:
+        """Return the version of the viewed datum (0: never set)."""
+        state = self.state(request)
+        return state.version if state is not None else 0
+
+    def encoded(self, request: LockRequest[Any]) -> Any:
+        """Return the encoded datum of one request.
+
+        Raises:
+            NullDatumError: The world context does not know it.
+        """
+        check_requested(request, self._requests, "view")
+        slot = slot_of(request)
+        state = self._readings.state(slot)
+        if state is None or state.null_reason:
+            raise self._readings.null_error(slot)
+        return self._readings.datum(slot)
+
+    def __repr__(self) -> str:
+        return f"Snapshot({', '.join(map(repr, self._requests))})"
+
+
+def raw_datum(context: Context, session: Session, entity: Entity, aspect: str) -> object:
+    """Return a datum without knowing its Python type; as `WorldContext.raw`."""
+    check_argument("raw(entity, aspect)", "entity", entity, Entity)
+    check_argument("raw(entity, aspect)", "aspect", aspect, str)
+    known_aspect(session, aspect)
+    request = View(context, entity, Aspect(aspect, object))
+    return decode_untyped(take_snapshot((request,), register=False).encoded(request))
+
+
+def known_aspect(session: Session, name: str) -> AspectEntry:
+    """Return the entry of a registered aspect.
+
+    Raises:
+        MisuseError: No such aspect is registered.
+    """
+    client = session.client
+    if name not in client.aspect_entries():
+        client.greet()
+    known = client.aspect_entries()
+    if name not in known:
+        raise unknown_aspect(name, known)
+    return known[name]

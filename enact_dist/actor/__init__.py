@@ -1,0 +1,1 @@
+"""Actors: a class with typed aspects, from its check to its running process."""

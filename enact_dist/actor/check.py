@@ -1,0 +1,325 @@
+"""Static check of a cell's actors: their reads and writes, before any actor runs.
+
+Reported are (error: `enact up` refuses; warning: it says so and starts; advice: it starts):
+
+=======  ===================  ===================================================================
+level    kind                 what
+=======  ===================  ===================================================================
+error    no such actor        a class, option or period of `cell.toml` that cannot be used
+error    broken module        a module that raises at its import, and where
+error    unbound role         a role that no world context is bound to
+error    unknown role         a binding for a role that the actor does not have
+error    unknown world        a world context that the cell does not list
+error    unknown aspect       an aspect that the cell does not list
+error    no such entity       the one `entity` of an actor does not match what it declares
+error    two types            one aspect name with two datum types
+error    own trigger          an actor that, as bound, writes what triggers it
+error    two writers          two actors that write one slot, not both declaring it as `shared`
+warning  entity unsaid        an actor without triggers names a pattern, and neither `cell.toml` nor
+                              its class says for which entity: its `__init__` has to
+warning  unwritten trigger    a trigger that no actor writes: only a write from outside runs it
+warning  unwritten read       a reading request for data that no actor writes
+warning  set not retained     an aspect of a `Together` has no history (retention = 1): a set is
+                              gone as soon as one of its slots moves on
+warning  set without stamps   a datum of a `Together` that no actor writes with a capture stamp
+warning  unused aspect        `cell.toml` configures an aspect that no actor names: misspelt?
+advice   durable stream       data that are written ten times a second or more, each forced to the
+                              disk as nothing says how durable they are
+=======  ===================  ===================================================================
+
+World contexts and aspects are checked only against a list that is given, types against each other:
+no shard is asked, and an actor whose type a shard knows otherwise is refused at its start.  What a
+patterned write without `Each` can reach is narrowed by what triggers its actor only as far as the
+pattern says.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from enact_dist.actor.drawing.flows import streams, unstamped_sets
+from enact_dist.actor.drawing.uses import ActorDeclaration as ActorDeclaration  # noqa: PLC0414
+from enact_dist.actor.drawing.uses import Finding as Finding  # noqa: PLC0414 - both are found here, too
+from enact_dist.actor.drawing.uses import uses_of
+from enact_dist.actor.running.load import check_every_s, load_class, read_options
+from enact_dist.actor.running.user_code import raised
+from enact_dist.config.table import suggestion
+from enact_dist.core.protocol.datum_types import newest, type_conflict
+from enact_dist.core.protocol.messages import AspectEntry
+from enact_dist.core.state.retention import limits_of, said, with_larger
+from enact_dist.errors import ConfigError, MisuseError
+from enact_dist.retention import checked_retention
+from enact_dist.terms import Entity
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+
+    from enact_dist.actor.actor import Actor
+    from enact_dist.actor.drawing.uses import Use
+    from enact_dist.config.types import CellConfig
+
+
+def check_actors(
+    actors: Sequence[ActorDeclaration],
+    *,
+    worlds: Collection[str] = (),
+    aspects: Collection[str] = (),
+    initial: Collection[str] = (),
+) -> tuple[Finding, ...]:
+    """Check all declared reads and writes of a cell against each other.
+
+    Args:
+        actors: Every actor that runs in the cell.
+        worlds: World contexts of the cell; empty: any.
+        aspects: Aspects that the cell lists; empty: any.
+        initial: Names of aspects that are written from outside (`init`, other programs).
+
+    Returns:
+        Errors first, each kind in the order of `actors`.
+    """
+    uses = list(uses_of(actors))
+    findings = [
+        *_roles(actors, worlds),
+        *_entities(actors),
+        *_aspects(uses, aspects),
+        *_types(uses),
+        *_own_triggers(uses),
+        *_writers(uses),
+        *_unwritten(uses, initial),
+        *unstamped_sets(uses),
+    ]
+    return _ordered(findings)
+
+
+def check_cell(config: CellConfig, *, initial: Collection[str] = ()) -> tuple[Finding, ...]:
+    """Check all actors that a `cell.toml` configures: that they load, and `check_actors`.
+
+    No actor is made; only its module is imported.  An actor without `worlds` in the file has each
+    role bound to the world context of its name, as running it does.  The file's list of aspects
+    names those whose durability differs, so an aspect that it does not list is no finding.
+
+    Args:
+        config: The cell.
+        initial: Names of aspects that are written from outside (`init`, other programs).
+    """
+    actors, findings = declarations_of(config)
+    findings += check_actors(actors, worlds=config.worlds, initial=initial)
+    findings += streams(
+        list(uses_of(actors)), {one.name for one in config.aspects if one.durability}
+    )
+    findings += _sets(actors, {entry.name: entry for entry in config.aspect_entries()})
+    named = {
+        request.aspect.name
+        for actor in actors
+        for request in actor.actor_class.declaration.requests.values()
+    }
+    for entry in config.aspects if len(actors) == len(config.actors) and actors else ():
+        if entry.name not in named:
+            findings.append(
+                Finding(
+                    "warning",
+                    "unused aspect",
+                    (),
+                    f"{config.path} configures the aspect {entry.name}, which no actor of the cell"
+                    f" reads or writes{suggestion(entry.name, named)}",
+                )
+            )
+    return _ordered(findings)
+
+
+def declarations_of(config: CellConfig) -> tuple[list[ActorDeclaration], list[Finding]]:
+    """Return the actors of a `cell.toml` that load, and what is wrong with those that do not."""
+    findings: list[Finding] = []
+    actors: list[ActorDeclaration] = []
+    for actor in config.actors:
+        try:
+            actor_class = load_class(actor.class_path)
+            only = Entity(actor.entity) if actor.entity else actor_class.only_entity
+            declared = ActorDeclaration(
+                actor.name, actor_class, actor.worlds or None, only, actor.every_s
+            )
+            actors.append(declared)
+            chosen = _of_options(actor_class, read_options(actor_class, actor.options))
+            actors[-1] = replace(declared, actor_class=chosen)
+            if actor.every_s is not None:
+                check_every_s(actor_class, actor.every_s)
+        except MisuseError as error:
+            if type(error) is ConfigError:
+                text = f"actor {actor.name}: {error}"
+                findings.append(Finding("error", "no such actor", (actor.name,), text))
+                continue
+            text = f"actor {actor.name} ({actor.class_path}): {raised(error.__cause__ or error)}"
+            findings.append(Finding("error", "broken module", (actor.name,), text))
+    return actors, findings
+
+
+def _of_options(actor_class: type[Actor], options: Mapping[str, object]) -> type[Actor]:
+    """Return the class that options make of one.
+
+    Raises:
+        ConfigError: It refuses them.
+    """
+    try:
+        return actor_class.of_options(options)
+    except ValueError as error:
+        raise ConfigError(f"{actor_class.__name__} refuses its options: {error}") from error
+
+
+def _sets(
+    actors: Iterable[ActorDeclaration], configured: Mapping[str, AspectEntry]
+) -> Iterator[Finding]:
+    """Find sets of data that have no history, by the word of `cell.toml` or of the actor."""
+    for actor in actors:
+        together = actor.actor_class.declaration.together
+        for request in together.requests if together is not None else ():
+            aspect = request.aspect
+            entry = AspectEntry(aspect.name, "", "", *said(checked_retention(aspect.retention)))
+            entry = with_larger(entry, configured.get(aspect.name, entry))
+            if limits_of(entry).versions == 1:
+                yield Finding(
+                    "warning",
+                    "set not retained",
+                    (actor.name,),
+                    f"{request!r} of {actor.name} is part of a set, and {aspect.name} has no"
+                    " history: the set is gone as soon as this datum is written again; give"
+                    f" [aspects.{aspect.name}] or Aspect(…) a retention of as many versions as"
+                    " are under way at once",
+                )
+
+
+def _ordered(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    levels = ("error", "warning", "advice")
+    return tuple(sorted(findings, key=lambda finding: levels.index(finding.level)))
+
+
+def _roles(actors: Iterable[ActorDeclaration], worlds: Collection[str]) -> Iterator[Finding]:
+    for actor in actors:
+        roles = actor.actor_class.declaration.roles
+        for role in roles:
+            world = actor.world_of(role)
+            if world is None:
+                yield Finding(
+                    "error",
+                    "unbound role",
+                    (actor.name,),
+                    f"role {role} of actor {actor.name} is bound to no world context; bind it"
+                    f" with worlds = {{ {role} = NAME }}, or --world {role}=NAME",
+                )
+            elif worlds and world not in worlds:
+                yield Finding(
+                    "error",
+                    "unknown world",
+                    (actor.name,),
+                    f"role {role} of actor {actor.name} is bound to {world}, which the cell does"
+                    f" not have; it has {', '.join(sorted(worlds))}",
+                )
+        for role in actor.worlds or ():
+            if role not in roles:
+                yield Finding(
+                    "error",
+                    "unknown role",
+                    (actor.name,),
+                    f"actor {actor.name} has no role {role}; it has {', '.join(roles)}",
+                )
+
+
+def _entities(actors: Iterable[ActorDeclaration]) -> Iterator[Finding]:
+    for actor in actors:
+        unsaid = actor.unsaid
+        try:
+            actor.actor_class.declaration.check_entity(actor.entity)
+        except MisuseError as error:
+            kind = "entity unsaid" if unsaid else "no such entity"
+            text = f"actor {actor.name}: {error}"
+            yield Finding("warning" if unsaid else "error", kind, (actor.name,), text)
+
+
+def _aspects(uses: Iterable[Use], aspects: Collection[str]) -> Iterator[Finding]:
+    for use in uses:
+        aspect = use.request.aspect.name
+        if aspects and aspect not in aspects:
+            yield Finding(
+                "error",
+                "unknown aspect",
+                (use.actor.name,),
+                f"{use} uses the aspect {aspect}, which the cell does not list; it lists"
+                f" {', '.join(sorted(aspects))}",
+            )
+
+
+def _types(uses: Sequence[Use]) -> Iterator[Finding]:
+    """Yield the uses of an aspect with a type that does not go with the newest one written."""
+    from enact_dist.wire.fingerprint import fingerprint
+
+    known: dict[str, tuple[Use, AspectEntry]] = {}
+    entries: list[tuple[Use, AspectEntry]] = []
+    for use in uses:
+        aspect, reads = use.request.aspect, not use.request.access.writes
+        entry = AspectEntry(aspect.name, fingerprint(aspect.datum_type), "", reads=reads)
+        entries.append((use, entry))
+    for use, entry in sorted(entries, key=lambda each: each[1].reads):  # first those that write
+        _, before = known.setdefault(entry.name, (use, entry))
+        if not entry.reads and newest(before, entry) == entry:
+            known[entry.name] = (use, entry)
+    for use, entry in entries:
+        other, registered = known[entry.name]
+        if use is not other and type_conflict(registered, entry):
+            yield Finding(
+                "error",
+                "two types",
+                (other.actor.name, use.actor.name),
+                f"aspect {entry.name} is {registered.fingerprint} for {other}, but"
+                f" {entry.fingerprint} for {use}",
+            )
+
+
+def _own_triggers(uses: Sequence[Use]) -> Iterator[Finding]:
+    for use in uses:
+        if use.request not in use.actor.actor_class.declaration.triggers:
+            continue
+        for other in uses:
+            if other.actor is use.actor and other.request.access.writes and other.meets(use):
+                yield Finding(
+                    "error",
+                    "own trigger",
+                    (use.actor.name,),
+                    f"{other} writes what {use} triggers on, so each update causes the next one;"
+                    " bind the roles to different world contexts",
+                )
+
+
+def _writers(uses: Sequence[Use]) -> Iterator[Finding]:
+    writes = [use for use in uses if use.request.access.writes]
+    for index, one in enumerate(writes):
+        for other in writes[index + 1 :]:
+            if one.actor is other.actor or not one.meets(other) or (one.shared and other.shared):
+                continue
+            if one.unsaid or other.unsaid:  # the slot that it writes is unknown
+                continue
+            yield Finding(
+                "error",
+                "two writers",
+                (one.actor.name, other.actor.name),
+                f"{one} and {other} can write one slot, and the later one hides the other's datum;"
+                " give each its own, or list the request in `shared` of both classes if each"
+                " keeps what the other wrote",
+            )
+
+
+def _unwritten(uses: Sequence[Use], initial: Collection[str]) -> Iterator[Finding]:
+    writes = [use for use in uses if use.request.access.writes]
+    for use in uses:
+        request = use.request
+        if request.access.writes or request.aspect.name in initial:
+            continue
+        if any(write.meets(use) for write in writes):
+            continue
+        triggers = request in use.actor.actor_class.declaration.triggers
+        yield Finding(
+            "warning",
+            "unwritten trigger" if triggers else "unwritten read",
+            (use.actor.name,),
+            f"no actor of the cell writes what {use} {'waits for' if triggers else 'reads'};"
+            " it stays null unless something outside writes it",
+        )

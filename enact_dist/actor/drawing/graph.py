@@ -1,0 +1,371 @@
+"""The actors of a cell and their data as a picture: what Figures 4 and 7 of the ENACT paper show.
+
+World contexts (grey) stand in the middle, each with its entities (green) and their aspects
+(orange).  Actors (blue) stand on both sides, those that the data reach first on the left.  Each
+declared read and write is one line.  Lines run between the columns only, so none crosses a box.
+
+`graph_of` collects, `laid_out` places (PURE, both), `actor.drawing.svg` draws.  Actors of one class
+and one binding that differ in their `entity` only, such as eight cameras, are one box.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.actor.drawing.uses import uses_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from enact_dist.actor.drawing.uses import ActorDeclaration, Use
+
+CHARACTER: Final = 8.2
+"""Mean width of a character in the widest of the usual bold fonts, pixels."""
+ROW: Final = 22.0
+"""Height of an aspect, or of a line of text, pixels."""
+GAP: Final = 10.0
+GUTTER: Final = 190.0
+"""Between the columns, for the lines."""
+MARGIN: Final = 24.0
+NAMES_MAX: Final = 3
+"""Names of a group that are written out."""
+
+Datum = tuple[str, str, str]
+"""World context, entity or pattern, aspect."""
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Actors that are drawn as one box.
+
+    Attributes:
+        key: What tells it from others.
+        title: Its class.
+        names: Its actors.
+        note: When they run, and how often they do if that is known.
+        layer: Number of groups that data pass before they come to this one.
+    """
+
+    key: str
+    title: str
+    names: tuple[str, ...]
+    note: str = ""
+    layer: int = 0
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """What is written into its box."""
+        many = f" ({len(self.names)})" if len(self.names) > 1 else ""
+        names = ", ".join(self.names[:NAMES_MAX]) + ", …" * (len(self.names) > NAMES_MAX)
+        plain = names.replace("-", "").replace("_", "").lower() == self.title.lower()
+        return tuple(
+            line for line in (self.title + many, "" if plain else names, self.note) if line
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """One declared request of a group.
+
+    Attributes:
+        group: Key of the group.
+        name: Name of the request in the class.
+        datum: What it names.
+        writes: Whether it may write.
+        locks: Whether it holds a lock, which a view does not.
+        triggers: Whether it makes the actor run.
+    """
+
+    group: str
+    name: str
+    datum: Datum
+    writes: bool
+    locks: bool
+    triggers: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Graph:
+    """All groups and lines, in the order of the actors."""
+
+    groups: tuple[Group, ...]
+    lines: tuple[Line, ...]
+
+    @property
+    def data(self) -> tuple[Datum, ...]:
+        """Every datum that a line leads to, those of one entity behind each other."""
+        order: dict[str, dict[str, dict[str, None]]] = {}
+        for world, entity, aspect in (line.datum for line in self.lines):
+            order.setdefault(world, {}).setdefault(entity, {})[aspect] = None
+        return tuple(
+            (world, entity, aspect)
+            for world, entities in order.items()
+            for entity, aspects in entities.items()
+            for aspect in aspects
+        )
+
+
+def graph_of(
+    actors: Sequence[ActorDeclaration], *, rates_hz: Mapping[str, float] | None = None
+) -> Graph:
+    """Return the graph of a cell's actors.
+
+    Args:
+        actors: Every actor, as `actor.check` takes them.
+        rates_hz: Updates per second of running actors, by name.
+    """
+    members: dict[str, list[ActorDeclaration]] = {}
+    for actor in actors:
+        members.setdefault(_key(actor), []).append(actor)
+    uses = [use for those in members.values() for use in uses_of(those[:1])]
+    layers = _layers(uses)
+    groups = [
+        Group(
+            key,
+            those[0].actor_class.__name__,
+            tuple(one.name for one in those),
+            _note(those, rates_hz or {}),
+            layers.get(those[0].name, 0),
+        )
+        for key, those in members.items()
+    ]
+    single = {key for key, those in members.items() if len(those) == 1}
+    lines = [
+        Line(
+            key,
+            use.name,
+            (use.world, *_place(use, named=key in single)),
+            use.request.access.writes,
+            use.request.access.locks,
+            use.request in use.actor.actor_class.declaration.triggers,
+        )
+        for use in uses
+        for key in (_key(use.actor),)
+    ]
+    return Graph(tuple(groups), tuple(lines))
+
+
+def _key(actor: ActorDeclaration) -> str:
+    if actor.entity is None:
+        return actor.name
+    kind = f"{actor.actor_class.__module__}:{actor.actor_class.__qualname__}"
+    return f"{kind} {sorted((actor.worlds or {}).items())}"
+
+
+def _place(use: Use, *, named: bool) -> tuple[str, str]:
+    request = use.named if named else use.request
+    return str(request.entity), request.aspect.name
+
+
+def _note(actors: Sequence[ActorDeclaration], rates_hz: Mapping[str, float]) -> str:
+    found = [rates_hz[actor.name] for actor in actors if actor.name in rates_hz]
+    if found:
+        low, high = min(found), max(found)
+        return f"{low:.1f}/s" if f"{low:.1f}" == f"{high:.1f}" else f"{low:.1f} to {high:.1f}/s"
+    period_s = actors[0].period_s
+    if period_s is not None:
+        return f"every {period_s:g} s"
+    return "" if actors[0].actor_class.declaration.triggers else "once"
+
+
+def _layers(uses: Sequence[Use]) -> dict[str, int]:
+    """Return how many actors data pass before each; what comes back in a circle is left out."""
+    comes_from: dict[str, set[str]] = {use.actor.name: set() for use in uses}
+    for reader in uses:
+        if reader.request.access.writes:
+            continue
+        for writer in uses:
+            if writer.request.access.writes and writer.meets(reader):
+                comes_from[reader.actor.name].add(writer.actor.name)
+    found: dict[str, int] = {}
+
+    def layer(name: str, passed: frozenset[str]) -> int:
+        if name not in found:
+            before = [layer(one, passed | {name}) for one in comes_from[name] - passed - {name}]
+            depth = 1 + max(before, default=-1)
+            if passed:
+                return depth
+            found[name] = depth
+        return found[name]
+
+    for name in comes_from:
+        layer(name, frozenset())
+    return found
+
+
+# ---------------------------------------------------------------- where everything stands
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """A rectangle, pixels: left, top, width, height."""
+
+    x: float
+    y: float
+    width: float
+    height: float
+
+    @property
+    def right(self) -> float:
+        """Right edge."""
+        return self.x + self.width
+
+    @property
+    def bottom(self) -> float:
+        """Lower edge."""
+        return self.y + self.height
+
+    @property
+    def middle_y(self) -> float:
+        """Height of the middle."""
+        return self.y + self.height / 2.0
+
+
+@dataclass(slots=True)
+class Layout:
+    """Where everything stands, pixels.
+
+    Attributes:
+        worlds: Box of each world context.
+        entities: Box of each (world context, entity).
+        aspects: Box of each datum.
+        actors: Box of each group, by its key.
+        ends: Both ends of each line, (x, y) at the actor and (x, y) at the aspect.
+        width: Of the whole.
+        height: Of the whole.
+    """
+
+    worlds: dict[str, Box] = field(default_factory=dict)
+    entities: dict[tuple[str, str], Box] = field(default_factory=dict)
+    aspects: dict[Datum, Box] = field(default_factory=dict)
+    actors: dict[str, Box] = field(default_factory=dict)
+    ends: list[tuple[tuple[float, float], tuple[float, float]]] = field(default_factory=list)
+    width: float = 0.0
+    height: float = 0.0
+
+
+def laid_out(graph: Graph) -> Layout:
+    """Return where everything stands: actors, data, actors, from left to right."""
+    layout = Layout()
+    left, right = _sides(graph)
+    widths = [
+        max((_width(line) for group in side for line in group.lines), default=0.0)
+        for side in (left, right)
+    ]
+    data_x = MARGIN + widths[0] + GUTTER * bool(left)
+    _place_data(graph, layout, data_x)
+    data_right = max((box.right for box in layout.worlds.values()), default=data_x)
+    right_x = data_right + GUTTER
+    for side, x, width in ((left, MARGIN, widths[0]), (right, right_x, widths[1])):
+        _place_actors(graph, layout, side, x, width)
+    boxes = [*layout.worlds.values(), *layout.actors.values()]
+    layout.width = max((box.right for box in boxes), default=0.0) + MARGIN
+    layout.height = max((box.bottom for box in boxes), default=0.0) + MARGIN
+    _place_lines(graph, layout, {group.key for group in left})
+    return layout
+
+
+def _width(text: str) -> float:
+    return len(text) * CHARACTER + 2.0 * GAP
+
+
+def _sides(graph: Graph) -> tuple[list[Group], list[Group]]:
+    """Return the groups that stand on the left and on the right: half of the lines on each."""
+    order = sorted(graph.groups, key=lambda group: group.layer)
+    count = {group.key: 1.0 for group in order}
+    for line in graph.lines:
+        count[line.group] += 1.0
+    half, sofar = sum(count.values()) / 2.0, 0.0
+    left: list[Group] = []
+    for group in order:
+        if left and sofar + count[group.key] / 2.0 > half:
+            break
+        sofar += count[group.key]
+        left.append(group)
+    return left, order[len(left) :]
+
+
+def _place_data(graph: Graph, layout: Layout, x: float) -> None:
+    data = graph.data
+    texts = [text for datum in data for text in datum]
+    width = max((_width(text) for text in texts), default=0.0) + 2.0 * GAP
+    y = MARGIN
+    for world in dict.fromkeys(datum[0] for datum in data):
+        top = y
+        y += ROW + GAP
+        for entity in dict.fromkeys(one[1] for one in data if one[0] == world):
+            entity_top = y
+            y += ROW
+            for datum in (one for one in data if one[:2] == (world, entity)):
+                layout.aspects[datum] = Box(x + 2.0 * GAP, y, width, ROW)
+                y += ROW + GAP / 2.0
+            y += GAP / 2.0
+            box = Box(x + GAP, entity_top, width + 2.0 * GAP, y - entity_top)
+            layout.entities[world, entity] = box
+            y += GAP
+        layout.worlds[world] = Box(x, top, width + 4.0 * GAP, y - top)
+        y += 2.0 * GAP
+
+
+def _place_actors(
+    graph: Graph, layout: Layout, side: Sequence[Group], x: float, width: float
+) -> None:
+    """Stack the actors of one side, each as near to the middle of its data as there is room."""
+    at: Callable[[Group], float] = lambda group: _mean(  # noqa: E731
+        [layout.aspects[line.datum].middle_y for line in graph.lines if line.group == group.key]
+    )
+    heights = {
+        group.key: max(
+            len(group.lines) * (ROW - 4.0) + GAP,
+            sum(line.group == group.key for line in graph.lines) * GAP,
+        )
+        for group in side
+    }
+    order = sorted(side, key=at)
+    tops: list[float] = []
+    floor = MARGIN
+    for group in order:
+        tops.append(max(floor, at(group) - heights[group.key] / 2.0))
+        floor = tops[-1] + heights[group.key] + 2.0 * GAP
+    ceiling = max((box.bottom for box in layout.worlds.values()), default=0.0)
+    for index in range(len(order) - 1, -1, -1):  # back up, where the last ones hang over
+        height = heights[order[index].key]
+        lowest = max(ceiling - height, MARGIN + _stacked(order[:index], heights))
+        tops[index] = min(tops[index], lowest)
+        ceiling = tops[index] - 2.0 * GAP
+    for group, top in zip(order, tops, strict=True):
+        layout.actors[group.key] = Box(x, top, width, heights[group.key])
+
+
+def _stacked(groups: Sequence[Group], heights: Mapping[str, float]) -> float:
+    return sum(heights[group.key] + 2.0 * GAP for group in groups)
+
+
+def _mean(numbers: Sequence[float]) -> float:
+    return sum(numbers) / len(numbers) if numbers else 0.0
+
+
+def _place_lines(graph: Graph, layout: Layout, left: set[str]) -> None:
+    """Give each line a place of its own at both of its ends, in the order of the other ends."""
+    at_actor: dict[int, float] = {}
+    for key, box in layout.actors.items():
+        mine = [index for index, line in enumerate(graph.lines) if line.group == key]
+        mine.sort(key=lambda index: layout.aspects[graph.lines[index].datum].y)
+        for place, index in enumerate(mine):
+            at_actor[index] = box.y + box.height * (place + 1) / (len(mine) + 1)
+    at_datum: dict[int, float] = {}
+    for datum, box in layout.aspects.items():
+        for on_left in (True, False):
+            here = [
+                index
+                for index, line in enumerate(graph.lines)
+                if line.datum == datum and (line.group in left) == on_left
+            ]
+            here.sort(key=at_actor.__getitem__)
+            for place, index in enumerate(here):
+                at_datum[index] = box.y + box.height * (place + 1) / (len(here) + 1)
+    for index, line in enumerate(graph.lines):
+        actor, aspect = layout.actors[line.group], layout.aspects[line.datum]
+        xs = (actor.right, aspect.x) if line.group in left else (actor.x, aspect.right)
+        layout.ends.append(((xs[0], at_actor[index]), (xs[1], at_datum[index])))

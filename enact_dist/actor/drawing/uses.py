@@ -1,0 +1,110 @@
+"""What `actor.check` looks at, and what it finds: actors, their requests, findings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+from enact_dist.actor.actor import narrowed, same_data, stands_for_trigger
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+
+    from enact_dist.actor.actor import Actor, Declared
+    from enact_dist.terms import Entity
+
+Level = Literal["error", "warning", "advice"]
+
+
+@dataclass(frozen=True, slots=True)
+class ActorDeclaration:
+    """One actor of a cell: under which name it runs, its class, what its roles are bound to.
+
+    `worlds` None binds each role to the world context of the same name, as running it does;
+    `entity` is the only one that it works on, or None for no such limit; `every_s` replaces the
+    period of its class.
+    """
+
+    name: str
+    actor_class: type[Actor]
+    worlds: Mapping[str, str] | None = None
+    entity: Entity | None = None
+    every_s: float | None = None
+
+    @property
+    def period_s(self) -> float | None:
+        """Its period in seconds, if it is a source."""
+        return self.every_s or self.actor_class.every_s
+
+    @property
+    def unsaid(self) -> bool:
+        """Whether it works on one entity that the declaration does not name."""
+        declaration = self.actor_class.declaration
+        return self.entity is None and declaration.per_entity and not declaration.triggers
+
+    def world_of(self, role: str) -> str | None:
+        """Return the world context that a role is bound to."""
+        return role if self.worlds is None else self.worlds.get(role)
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that is wrong, or likely so, with the actors of a cell.
+
+    Attributes:
+        level: "error", "warning" or "advice".
+        kind: As in the table of `actor.check`.
+        actors: Names of the actors concerned.
+        text: What was found and what to do.
+    """
+
+    level: Level
+    kind: str
+    actors: tuple[str, ...]
+    text: str
+
+    def __str__(self) -> str:
+        return f"{self.level}: {self.kind}: {self.text}"
+
+
+@dataclass(frozen=True, slots=True)
+class Use:
+    """One declared request of one actor, its role bound."""
+
+    actor: ActorDeclaration
+    name: str
+    request: Declared
+    world: str
+
+    @property
+    def unsaid(self) -> bool:
+        """Whether it is of one entity that the declaration does not name."""
+        return self.actor.unsaid and stands_for_trigger(self.request)
+
+    @property
+    def named(self) -> Declared:
+        """What the request can name in this actor."""
+        return narrowed(self.request, self.actor.entity)
+
+    @property
+    def shared(self) -> bool:
+        """Whether it is a write that others share on purpose."""
+        return self.request in self.actor.actor_class.declaration.shared
+
+    def meets(self, other: Use) -> bool:
+        """Whether both could name one datum."""
+        return self.world == other.world and same_data(self.named, other.named)
+
+    def __str__(self) -> str:
+        _, entity, aspect = self.named.address
+        access = type(self.request).__name__
+        return f"{self.actor.name}.{self.name} ({access} {self.world}/{entity} {aspect})"
+
+
+def uses_of(actors: Iterable[ActorDeclaration]) -> Iterator[Use]:
+    """Yield every declared request whose role is bound."""
+    for actor in actors:
+        for name, request in actor.actor_class.declaration.requests.items():
+            world = actor.world_of(request.world.name)
+            if world is not None:
+                yield Use(actor, name, request, world)

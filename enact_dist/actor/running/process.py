@@ -1,0 +1,156 @@
+"""Actors beside each other: as threads of one process, or each as a process of its own.
+
+Threads share one cell (the paper's own mode, and the only one on `local()`).  Processes are
+started afresh, never forked: a forked child would share its parent's session and threads it does
+not have.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from typing import TYPE_CHECKING, Self
+
+from enact_dist.actor.running.runner import ActorRun, OnError
+from enact_dist.errors import MisuseError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from enact_dist.actor.actor import Actor
+    from enact_dist.actor.report import ActorStatistics
+    from enact_dist.world.cell import Cell
+
+
+class ActorThread:
+    """An actor that runs in a thread of this process; a context manager that stops it.
+
+    ::
+
+        with ActorThread(Fusion(), cell), ActorThread(Feedback(), cell):
+            ...                                    # both run until the block ends
+
+    Args:
+        actor: The actor; a fresh instance, run once.
+        cell: Where its world contexts are; several threads may share it.
+        worlds: Role → name of a world context; None binds each role to the context of its name.
+        name: Name in logs and reports; by default the class's, with that of its `only_entity`.
+        wait_s: How long an attempt waits for its lock; None: as long as the actor says.
+        on_error: Called with each error, besides the log, in the actor's thread.
+
+    Raises:
+        MisuseError: The actor cannot be bound like this.
+        UnknownWorldError: The cell has no such world context.
+    """
+
+    def __init__(
+        self,
+        actor: Actor,
+        cell: Cell,
+        worlds: Mapping[str, str] | None = None,
+        *,
+        name: str = "",
+        wait_s: float | None = None,
+        on_error: OnError | None = None,
+    ) -> None:
+        self._stop = threading.Event()
+        self._run = ActorRun(
+            actor, cell, worlds, stop=self._stop, name=name, wait_s=wait_s, on_error=on_error
+        )
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._work, name=self._run.name, daemon=True)
+
+    def start(self) -> Self:
+        """Start the thread."""
+        self._thread.start()
+        return self
+
+    def statistics(self) -> ActorStatistics:
+        """Return what the actor has done so far."""
+        return self._run.statistics()
+
+    def stop(self) -> None:
+        """Ask the actor to stop after its current update.  Does not wait."""
+        self._stop.set()
+
+    def join(self, timeout_s: float | None = None) -> ActorStatistics:
+        """Wait until the actor has stopped, or is done, and return what it did.
+
+        Raises:
+            MisuseError: It still runs after `timeout_s`.
+            BaseException: What ended the run, if it did not end by itself.
+        """
+        self._thread.join(timeout_s)
+        if self._thread.is_alive():
+            raise MisuseError(
+                f"actor {self._run.name} still runs after {timeout_s} s; call stop() first, or"
+                " wait longer than its update and wait_s take"
+            )
+        if self._error is not None:
+            raise self._error
+        return self._run.statistics()
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+        self.join()
+
+    def _work(self) -> None:
+        try:
+            self._run.run()
+        except BaseException as error:  # noqa: BLE001 (raised again by join)
+            self._error = error
+
+
+def actor_command(
+    target: str,
+    *,
+    cell: str | Path,
+    name: str = "",
+    worlds: Mapping[str, str] | None = None,
+    options: Mapping[str, object] | None = None,
+    entity: str = "",
+) -> list[str]:
+    """Return the command that runs an actor as a process of its own.
+
+    Args:
+        target: ``MODULE:CLASS``.
+        cell: A `cell.toml` or an endpoint.
+        name: Name of the actor; by default its class's.
+        worlds: Role → name of a world context.
+        options: Parameters of the class, as text, numbers or truth values.
+        entity: The one entity that it works on; by default all that its patterns match.
+    """
+    command = [sys.executable, "-m", "enact_dist.cli.main", "actor", "run", target]
+    command += ["--cell", str(cell)]
+    command += ["--name", name] if name else []
+    for role, world in (worlds or {}).items():
+        command += ["--world", f"{role}={world}"]
+    for option, value in (options or {}).items():
+        command += ["--option", f"{option}={value}"]
+    command += ["--entity", entity] if entity else []
+    return command
+
+
+def spawn_actor(
+    target: str,
+    *,
+    cell: str | Path,
+    name: str = "",
+    worlds: Mapping[str, str] | None = None,
+    options: Mapping[str, object] | None = None,
+    entity: str = "",
+) -> subprocess.Popen[bytes]:
+    """Start an actor as a process of its own; arguments as for `actor_command`.
+
+    The process ends on SIGTERM after its current update; its log goes to this process's standard
+    error.
+    """
+    return subprocess.Popen(
+        actor_command(target, cell=cell, name=name, worlds=worlds, options=options, entity=entity),
+        stdin=subprocess.DEVNULL,
+    )

@@ -1,0 +1,188 @@
+"""Commands to a running actor: change its attributes, or restart it.
+
+Commands stand in one volatile datum of the entity `actor` in one of the actor's world contexts, by
+the session of the actor's process.  One slot serves all: a shard never forgets a slot, so one for
+each session would stay after the session.  The actor's process watches the slot, takes its command
+out of the datum, executes it between two updates, and answers in its report.  A writer drops the
+commands of sessions that are gone.  Changed values last until the process ends;
+`cell.toml` holds the values that an actor starts with.
+"""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import threading
+from typing import TYPE_CHECKING, Any, Final
+
+from enact_dist.access.lock import Lock
+from enact_dist.actor.running.load import attributes_of, read_option
+from enact_dist.errors import ConfigError, EnactError
+from enact_dist.terms import Aspect, Durability, Entity, View, Write
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from enact_dist.access.watch import Watch
+    from enact_dist.actor.actor import Actor
+    from enact_dist.actor.running.runner import ActorRun
+    from enact_dist.world.cell import Cell
+    from enact_dist.world.context import WorldContext
+    from enact_dist.world.listings import ActorInfo
+
+ACTOR: Final = Entity("actor")
+WORDS: Final = Aspect("actor_words", dict, Durability.VOLATILE, retention=1)
+DONE: Final = "done"
+"""Follows the token of an executed command in a report; otherwise the reason follows."""
+ENDS: Final = "ends, to begin anew"
+
+log = logging.getLogger("enact.actor")
+
+
+def words_of(world: WorldContext) -> Write[dict[str, Any]]:
+    """Return the request for the commands to actors, by the session of each."""
+    return Write(world, ACTOR, WORDS)
+
+
+def tell(world: WorldContext, word: dict[str, Any], *, session: str, live: Iterable[str]) -> None:
+    """Give the actor of a session a command; drop those of sessions that are not live.
+
+    Raises:
+        EnactError: The lock was not granted, or its commit failed.
+    """
+    request = words_of(world)
+    with Lock(request) as lock:
+        kept = {one: words for one, words in lock.get(request, {}).items() if one in {*live}}
+        lock[request] = {**kept, session: word}
+
+
+def reports_of(cell: Cell, name: str) -> list[tuple[ActorInfo, dict[str, Any]]]:
+    """Return the reports of the actors of a name, each with its session."""
+    return [
+        (info, row)
+        for info in cell.actors()
+        if not info.silent and isinstance(info.report.get("actors"), (list, tuple))
+        for row in info.report["actors"]
+        if isinstance(row, dict) and row.get("name") == name
+    ]
+
+
+def tell_reported(cell: Cell, info: ActorInfo, row: dict[str, Any], word: dict[str, Any]) -> str:
+    """Give a command to an actor that reports; return the token that its answer begins with.
+
+    Args:
+        cell: Where it runs.
+        info: Its session.
+        row: Its report, which names the world context in which it reads commands.
+        word: The command: `{"set": values}` or `{"restart": True}`.
+
+    Raises:
+        EnactError: The lock was not granted, or its commit failed.
+    """
+    token = secrets.token_hex(4)
+    live = [one.session for one in cell.actors() if not one.silent]
+    world = cell.world(str(row["words_in"]))
+    tell(world, {"token": token, **word}, session=info.session, live=live)
+    return token
+
+
+def with_values(actor: Actor, values: dict[str, str]) -> None:
+    """Change attributes of an actor, all or none.
+
+    Raises:
+        ConfigError: One is no attribute that can be changed, or the text is no value of its type.
+    """
+    hints = attributes_of(type(actor))
+    name = type(actor).__name__
+    read = {}
+    for key, text in values.items():
+        if key not in hints:
+            raise ConfigError(
+                f"{key} of actor {name} cannot be changed while it runs; these can:"
+                f" {', '.join(hints) or 'none'} (attributes with an annotation and a value in the"
+                " class)"
+            )
+        read[key] = read_option(f"option {key} of actor {name}", text, hints[key])
+    for key, value in read.items():
+        setattr(actor, key, value)
+
+
+class ListeningForWords:
+    """Listens for commands to one actor of this process, in a thread; a context manager.
+
+    Args:
+        actor: The actor.
+        run: Its run.
+        cell: Where it runs.
+        restart: Called to restart it.
+    """
+
+    def __init__(
+        self, actor: Actor, run: ActorRun, cell: Cell, restart: Callable[[], object]
+    ) -> None:
+        self._actor, self._run, self._restart = actor, run, restart
+        self._world = cell.world(run.words_in)
+        self._session = self._world.session.client.core.session
+        self._watch: Watch | None = None
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._listen, name="enact-words", daemon=True)
+
+    def __enter__(self) -> None:
+        self._thread.start()
+
+    def __exit__(self, *_: object) -> None:
+        self._closing.set()
+        watch = self._watch
+        if watch is not None:
+            watch.close()
+        self._thread.join(timeout=5.0)
+
+    def _listen(self) -> None:
+        while not self._closing.is_set():
+            try:
+                self._follow()
+            except EnactError as error:
+                log.info("%s: cannot receive commands for now: %s", self._run.name, error)
+                self._closing.wait(5.0)
+
+    def _follow(self) -> None:
+        with self._world.watch(ACTOR, WORDS) as watch:
+            self._watch = watch
+            while not self._closing.is_set():
+                change = watch.next()
+                if change is None:
+                    return
+                if not change.null:
+                    self._take()
+
+    def _take(self) -> None:
+        request = words_of(self._world)
+        seen = View(self._world, ACTOR, WORDS)
+        if self._session not in self._world.view(seen).get(seen, {}):
+            return
+        with Lock(request, wait_s=5.0) as lock:
+            words = dict(lock.get(request, {}))
+            word = words.pop(self._session, None)
+            if words:
+                lock[request] = words
+            else:
+                del lock[request]
+        if not isinstance(word, dict):
+            if word is not None:
+                log.warning("%s: an invalid command was ignored", self._run.name)
+            return
+        token = str(word.get("token", ""))
+        if word.get("restart"):
+            self._run.answer(f"{token} {ENDS}")
+            self._restart()
+            return
+        try:
+            values = {str(key): str(value) for key, value in dict(word.get("set", {})).items()}
+            with self._run.doing.between:
+                with_values(self._actor, values)
+        except (ConfigError, ValueError, TypeError, AttributeError) as error:
+            self._run.answer(f"{token} {error}")
+            return
+        told = ", ".join(f"{key} = {value}" for key, value in values.items())
+        log.info("%s: %s, as commanded", self._run.name, told)
+        self._run.answer(f"{token} {DONE}")

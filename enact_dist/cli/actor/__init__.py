@@ -1,0 +1,1 @@
+"""`enact actor`: run actors, and send them messages."""

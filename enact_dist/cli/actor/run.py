@@ -1,0 +1,431 @@
+"""`enact actor run`: one actor in this process, or several."""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import sys
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from enact_dist.actor.running.drain import DRAIN_S
+from enact_dist.actor.running.group import ANEW, ActorGroup, Life
+from enact_dist.actor.running.user_code import raised
+from enact_dist.actor.running.words import ListeningForWords
+from enact_dist.cli.verbs import (
+    DONE,
+    add_cell,
+    add_log,
+    add_timeout,
+    add_verb,
+    cell_config,
+    cell_target,
+    duration,
+    exit_status,
+    is_endpoint,
+    one_entity,
+    open_cell,
+    pair,
+    pairs,
+    seconds,
+    see_modules,
+    told,
+)
+from enact_dist.config.table import suggestion
+from enact_dist.config.types import ActorProcess, processes_of
+from enact_dist.errors import ConfigError, EnactError, MisuseError, UnknownWorldError
+from enact_dist.link.daemon.service_manager import ServiceManager
+from enact_dist.link.log import READY, JsonLines, TextLines, say
+from enact_dist.link.signals import StopSignals
+
+if TYPE_CHECKING:
+    import argparse
+    from collections.abc import Callable, Iterable, Mapping
+
+    from enact_dist.actor.actor import Actor
+    from enact_dist.actor.report import ActorStatistics
+    from enact_dist.actor.running.runner import ActorRun
+    from enact_dist.cli.verbs import Verb
+    from enact_dist.config.types import ActorConfig, CellConfig
+    from enact_dist.world.cell import Cell
+
+_log = logging.getLogger("enact.actor")
+_OF_ONE = (("--name", "name"), ("--world", "world"), ("--option", "option"),
+           ("--entity", "entity"), ("--every", "every"))  # fmt: skip
+"""Options that say something of one actor only."""
+
+
+def add_to(verbs: argparse._SubParsersAction[Verb]) -> None:
+    """Add the verb."""
+    run = add_verb(
+        verbs,
+        "run",
+        "run one actor, or several, in this process until SIGTERM or until all are done",
+        run=run_actors,
+        example="enact actor run fusion\n"
+        "enact actor run camera-3 subtraction-3\n"
+        "enact actor run --process camera-3\n"
+        "enact actor run actors.palletizing.fusion:Fusion --world training=training"
+        " --option voxel_m=0.002",
+    )
+    run.add_argument(
+        "targets",
+        nargs="*",
+        metavar="TARGET",
+        help="MODULE:CLASS, or the name of an actor of cell.toml; several names: these share the"
+        " process, each in a thread with a session of its own",
+    )
+    run.add_argument(
+        "--process",
+        default="",
+        metavar="NAME",
+        help="run all actors that have this `process` in cell.toml",
+    )
+    add_cell(run)
+    add_timeout(run)
+    add_log(run)
+    run.add_argument("--name", default="", help="how others see it (default: class and entity)")
+    run.add_argument(
+        "--world",
+        action="append",
+        type=pair,
+        metavar="ROLE=NAME",
+        help="bind a role to a world context; without any, each role to that of its name",
+    )
+    run.add_argument(
+        "--option", action="append", type=pair, metavar="KEY=VALUE", help="argument of the class"
+    )
+    run.add_argument(
+        "--entity",
+        type=one_entity,
+        metavar="NAME",
+        help="the one entity that it works on, of those that its patterns match",
+    )
+    run.add_argument("--every", type=seconds, metavar="S", help="period of a source, seconds")
+    run.add_argument(
+        "--drain",
+        dest="drain_s",
+        type=duration,
+        metavar="S",
+        help="seconds that an update may take after SIGTERM before it is cut off (default:"
+        " `drain_s` of the actor in cell.toml, else 8)",
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Made:
+    """An actor that is ready to run: what the command line or `cell.toml` says of it."""
+
+    actor: Actor
+    name: str
+    worlds: dict[str, str] | None
+    drain_s: float
+
+
+def run_actors(arguments: argparse.Namespace) -> int:
+    """Run actors until they are done or a signal comes."""
+    process = _process(arguments)
+    if process is not None and len(process.actors) > 1:
+        return _run_group(arguments, process)
+    manager = ServiceManager()
+    target = process.members[0] if process is not None else arguments.targets[0]
+    json_lines = JsonLines(process=f"actor {arguments.name or target}")
+    formatter = json_lines if arguments.log == "json" else TextLines()
+    _log_to_stderr(formatter)
+    made = _made(arguments, target)  # a signal ends an import at once
+    life = Life(made.name, made.drain_s, alive=manager.alive, ready=manager.ready)
+    with StopSignals() as signals:
+        for act in (lambda _: manager.stopping(), life.end):
+            signals.call(act)
+        signals.call_again(life.hurry)
+        return _lived(arguments, made, life, formatter)
+
+
+def _run_group(arguments: argparse.Namespace, process: ActorProcess) -> int:
+    """Run the actors of a process, each in a thread; see `actor.running.group`."""
+    manager = ServiceManager()
+    json_lines = JsonLines(process=f"process {process.name}", actors=process.members)
+    formatter = json_lines if arguments.log == "json" else TextLines(process.members)
+    _begin_with(process.env)
+    _log_to_stderr(formatter)
+    first: dict[str, _Made | Exception] = {}
+    for actor in process.actors:  # in this thread, where a signal ends an import at once
+        try:
+            first[actor.name] = _made(arguments, actor.name, begun=True)
+        except Exception as error:  # noqa: BLE001 - told where that actor begins; others run
+            first[actor.name] = error
+
+    def live(name: str, life: Life) -> int:
+        try:
+            made = first.pop(name, None) or _made(arguments, name, begun=True)
+            if isinstance(made, Exception):
+                raise made
+            return _lived(arguments, made, life, formatter)
+        except (EnactError, OSError, ImportError, MemoryError) as error:
+            for line in (*getattr(error, "__notes__", ()), told(error)):
+                _log.critical("actor %s: %s", name, line)
+            return exit_status(error)
+        except Exception as error:  # noqa: BLE001 - of a process of its own it would be the end
+            _log.exception("actor %s failed", name)
+            return exit_status(error)
+
+    drains_s = {one.name: _drain_s(arguments, one) for one in process.actors}
+    group = ActorGroup(process.name, drains_s, live, alive=manager.alive, ready=manager.ready)
+    with StopSignals() as signals:
+        for act in (lambda _: manager.stopping(), group.end):
+            signals.call(act)
+        signals.call_again(group.hurry)
+        return group.run()
+
+
+def _lived(
+    arguments: argparse.Namespace, made: _Made, life: Life, formatter: logging.Formatter
+) -> int:
+    """Run an actor once, in a session of its own; return its exit status."""
+    name = made.name
+    with open_cell(arguments, observer=False, actor=name) as cell:
+        if isinstance(formatter, JsonLines):
+            formatter.cell = cell.name
+            formatter.process = formatter.process if formatter.actors else f"actor {name}"
+        run = _bound(made, cell, life)
+        life.begin(run.doing)
+        restarts = threading.Event()
+
+        def restart() -> None:
+            restarts.set()
+            life.end("the word to begin anew")
+
+        def ready() -> None:
+            run.answer()
+            say(formatter, "actor.ready", f"{READY} actor {name} in cell {cell.name}")
+            life.ready()
+            _warn_of_namesakes(cell, name)
+
+        with ListeningForWords(made.actor, run, cell, restart):
+            statistics = _run(run, ready)
+    life.over()
+    counted = {key: getattr(statistics, key) for key in ("state", "updates", "failures", "refused")}
+    say(formatter, "actor.end", _farewell(name, statistics), **counted)
+    return ANEW if restarts.is_set() else DONE
+
+
+def _run(run: ActorRun, ready: Callable[[], None]) -> ActorStatistics:
+    """Run an actor to its end.
+
+    Raises:
+        MisuseError: Its `start` or `stop` raised something of its own.
+    """
+    try:
+        return run.run(on_ready=ready)
+    except EnactError:
+        raise
+    except Exception as error:
+        method = "start" if run.statistics().state == "starting" else "stop"
+        raise MisuseError(f"{method} of actor {run.name} failed: {raised(error)}") from error
+
+
+def _bound(made: _Made, cell: Cell, life: Life) -> ActorRun:
+    """Return the run of an actor whose roles are bound.
+
+    Raises:
+        ConfigError: They cannot be bound like this: the same command would fail the same way.
+        UnknownWorldError: The cell has no such world context; it may be made yet.
+    """
+    from enact_dist.actor.running.runner import ActorRun
+
+    try:
+        return ActorRun(made.actor, cell, made.worlds, stop=life.stop, name=made.name)
+    except UnknownWorldError:
+        raise
+    except MisuseError as error:
+        raise ConfigError(str(error)) from error
+
+
+def _warn_of_namesakes(cell: Cell, name: str) -> None:
+    """Say which other actors of this name run; several may be meant, so none is refused."""
+    try:
+        others = cell.namesakes(name)
+    except EnactError as error:
+        _log.info("whether another actor %s runs is not known: %s", name, error)
+        return
+    for other in others:
+        gone = other.host == socket.gethostname() and not _runs(other.pid)
+        if not gone:  # else a predecessor, whose session has not ended yet
+            _log.warning(
+                "another actor named %s runs, process %d on %s; unless both are meant, end one",
+                name, other.pid, other.host,
+            )  # fmt: skip
+
+
+def _runs(pid: int) -> bool:
+    """Whether a process of this host, and of this container, runs beside this one."""
+    return pid != os.getpid() and Path(f"/proc/{pid}").exists()
+
+
+def _log_to_stderr(formatter: logging.Formatter) -> None:
+    """Let the log of the actors and of what they use go to standard error."""
+    handler = logging.StreamHandler()
+    handler.setFormatter(formatter)
+    logging.basicConfig(level=logging.INFO, handlers=[handler])
+
+
+# ---------------------------------------------------------------- what the command names
+
+
+def _process(arguments: argparse.Namespace) -> ActorProcess | None:
+    """Return the actors of `cell.toml` that the command names; None for one ``MODULE:CLASS``.
+
+    Raises:
+        ConfigError: It names none, one twice, or several with what belongs to one.
+    """
+    targets: list[str] = arguments.targets
+    if arguments.process and targets:
+        raise ConfigError("name actors, or a process with --process, not both")
+    if not targets and not arguments.process:
+        raise ConfigError("name an actor of cell.toml, MODULE:CLASS, or --process NAME")
+    if len(targets) == 1 and ":" in targets[0]:
+        return None
+    if classes := [target for target in targets if ":" in target]:
+        raise ConfigError(
+            f"{classes[0]} runs in a process of its own; actors that share one have their tables"
+            " in cell.toml, and are called by their names"
+        )
+    config = cell_config(arguments)
+    if arguments.process:
+        actors = [one for one in config.actors if one.process == arguments.process]
+        known = {one.process for one in config.actors if one.process}
+        if not actors:
+            raise ConfigError(
+                f"{config.path} has no process {arguments.process!r}"
+                f"{suggestion(arguments.process, known)} (known: {_listed(known)})"
+            )
+    else:
+        actors = [_entry(config, target) for target in targets]
+    _refuse_of_one(arguments, actors)
+    (process, *others) = processes_of(actors)
+    if len(actors) > 1 and others:
+        process = ActorProcess("+".join(targets), tuple(actors))
+        _refuse_other_variables(process)
+    return process
+
+
+def _refuse_of_one(arguments: argparse.Namespace, actors: list[ActorConfig]) -> None:
+    """Raise `ConfigError` where several actors are given what belongs to one, or one twice."""
+    names = [one.name for one in actors]
+    twice = next((name for name in names if names.count(name) > 1), "")
+    if twice:
+        raise ConfigError(f"actor {twice} is named twice")
+    for option, key in _OF_ONE if len(actors) > 1 else ():
+        if getattr(arguments, key) not in (None, "", []):
+            raise ConfigError(
+                f"{option} belongs to one actor, but the command runs {', '.join(names)}; write it"
+                " into their tables of cell.toml"
+            )
+
+
+def _refuse_other_variables(process: ActorProcess) -> None:
+    """Raise `ConfigError` where actors that the command puts together differ in their `env`."""
+    for actor in process.actors:
+        for name, text in actor.env.items():
+            if process.env[name] != text:
+                raise ConfigError(
+                    f"the actors {', '.join(process.members)} cannot share a process: env sets"
+                    f" {name} to {text!r} for {actor.name} and to {process.env[name]!r} for another"
+                )
+
+
+def _entry(config: CellConfig, name: str) -> ActorConfig:
+    for entry in config.actors:
+        if entry.name == name:
+            return entry
+    raise ConfigError(
+        f"{config.path} has no actor {name!r} (known:"
+        f" {_listed(entry.name for entry in config.actors)}); or write MODULE:CLASS"
+    )
+
+
+def _made(arguments: argparse.Namespace, target: str, *, begun: bool = False) -> _Made:
+    """Make an actor that the command names.
+
+    Args:
+        arguments: Those of the command.
+        target: The actor.
+        begun: Whether the process has begun with all variables already; what an actor's module
+            makes of one when it is loaded is its own business.
+
+    Raises:
+        ConfigError: It does not exist and cannot be made.
+    """
+    from enact_dist.actor.actor import name_of
+    from enact_dist.actor.running.load import check_every_s, configured_actor, load_actor
+
+    worlds = pairs(arguments.world, "--world") or None
+    options = pairs(arguments.option, "--option")
+    drain_s = DRAIN_S if arguments.drain_s is None else arguments.drain_s
+    if ":" in target:
+        see_modules(_cell_file(arguments))
+        actor = load_actor(target, options)
+        name = ""
+    else:
+        config = cell_config(arguments)
+        see_modules(config.path)
+        entry = _entry(config, target)
+        if options:
+            raise ConfigError(f"the options of {entry.name} stand in {config.path}; leave --option")
+        if not begun:
+            _begin_with(entry.env)
+        actor = configured_actor(entry)
+        name = entry.name
+        drain_s = _drain_s(arguments, entry)
+        worlds = worlds or dict(entry.worlds) or None
+    if arguments.every is not None:
+        check_every_s(type(actor), arguments.every)
+        actor.every_s = arguments.every
+    if arguments.entity is not None:
+        actor.only_entity = arguments.entity
+    try:
+        actor.declaration.check_entity(actor.only_entity)
+    except MisuseError as error:
+        raise ConfigError(str(error)) from None
+    return _Made(actor, arguments.name or name or name_of(actor), worlds, drain_s)
+
+
+def _drain_s(arguments: argparse.Namespace, entry: ActorConfig) -> float:
+    for drain_s in (arguments.drain_s, entry.drain_s):
+        if drain_s is not None:
+            return float(drain_s)
+    return DRAIN_S
+
+
+def _begin_with(env: Mapping[str, str]) -> None:
+    """Restart this process with these variables, unless it has them.
+
+    Libraries read some when they are loaded, which they are by now.
+    """
+    if any(os.environ.get(name) != value for name, value in env.items()):
+        command = [sys.executable, *sys.orig_argv[1:]]
+        os.execve(command[0], command, {**os.environ, **env})  # noqa: S606 - itself
+
+
+def _cell_file(arguments: argparse.Namespace) -> Path | None:
+    """Return the cell.toml that the command names; None where it names an endpoint, or nothing."""
+    try:
+        target = cell_target(arguments)
+    except ConfigError:
+        return None  # reported when the cell is opened
+    return None if is_endpoint(target) else Path(target).expanduser()
+
+
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(names) or "none"
+
+
+def _farewell(name: str, statistics: ActorStatistics) -> str:
+    error = f"; last error: {statistics.last_error}" if statistics.last_error else ""
+    return (
+        f"{statistics.state}: actor {name} after {statistics.updates} updates,"
+        f" {statistics.failures} failures, {statistics.refused} refusals{error}"
+    )

@@ -1,0 +1,1 @@
+"""`enact shard`: list, run, back up and rebalance shards."""

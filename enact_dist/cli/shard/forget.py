@@ -1,0 +1,240 @@
+"""`enact shard forget`: lets aspects go with all their data, while the cell is stopped.
+
+It is how the type of an aspect changes: a shard that knows nothing of an aspect takes whatever type
+it is registered with next.
+"""
+
+from __future__ import annotations
+
+import shlex
+import socket
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from enact_dist.cli.text.output import ProgressLine, print_json, print_table, shown_bytes
+from enact_dist.cli.verbs import DONE, FAILED, add_cell, add_verb, cell_config, pair, pairs
+from enact_dist.errors import ConfigError
+
+if TYPE_CHECKING:
+    import argparse
+    from collections.abc import Iterable
+
+    from enact_dist.cli.verbs import Verb
+    from enact_dist.config.types import CellConfig
+    from enact_dist.link.offline.forgetting import Forgotten
+
+
+def add_to(verbs: argparse._SubParsersAction[Verb]) -> None:
+    """Add the verb."""
+    verb = add_verb(
+        verbs,
+        "forget",
+        "forget aspects with their types and all their data, while the cell is stopped; then they"
+        " may be registered with other types",
+        run=run_forget,
+        example="enact shard forget surface --cell cell.toml\n"
+        "enact shard forget surface contact_count --cell cell.toml --yes\n"
+        "enact shard forget --unused --cell cell.toml --dry-run",
+    )
+    verb.add_argument("aspects", metavar="ASPECT", nargs="*", help="name of an aspect")
+    verb.add_argument(
+        "--unused",
+        action="store_true",
+        help="forget all aspects and world contexts without data, except forks and those that"
+        " cell.toml names",
+    )
+    add_cell(verb, file_only=True)
+    verb.add_argument(
+        "--store",
+        action="append",
+        type=pair,
+        metavar="NAME=PATH",
+        help="folder of a shard that is not where the cell.toml says",
+    )
+    verb.add_argument(
+        "--shard",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="only this one: it was restored from a backup that has the aspect as it was",
+    )
+    what = verb.add_mutually_exclusive_group()
+    what.add_argument(
+        "--dry-run", action="store_true", help="say what would go, change nothing (status 0)"
+    )
+    what.add_argument(
+        "--yes",
+        action="store_true",
+        help="let it go; without it that is only said, with status 1 where there is anything",
+    )
+    verb.add_argument("--json", action="store_true", help="print JSON instead of a table")
+
+
+def run_forget(arguments: argparse.Namespace) -> int:
+    """Say what goes and let it go; it may be killed at any time and called again."""
+    from enact_dist.link.offline.forgetting import forget, look
+
+    config = cell_config(arguments)
+    folders, elsewhere = _folders(config, pairs(arguments.store, "--store"), arguments)
+    if not arguments.aspects and not arguments.unused:
+        raise ConfigError("name the aspects to forget, or --unused for all without data")
+    if arguments.unused and len(folders) < sum(s.folder is not None for s in config.shards):
+        raise ConfigError(
+            f"--unused needs the data of all shards, but {'; '.join(elsewhere) or 'not all'}:"
+            " name the folders of the others with --store"
+        )
+    unused = config.worlds if arguments.unused else None
+    told = _Told(as_json=arguments.json, goes="goes" if arguments.yes else "would go")
+    if not folders:
+        raise ConfigError(f"no shard of {config.path} has its data here: {'; '.join(elsewhere)}")
+    try:
+        if arguments.yes:
+            found = forget(
+                folders,
+                arguments.aspects,
+                now_ns=time.time_ns(),
+                unused=unused,
+                progress=told,
+            )
+        else:
+            found = look(folders, arguments.aspects, unused=unused, progress=told)
+    finally:
+        told.line.end()
+    if arguments.json:
+        print_json(_facts(found, elsewhere, done=arguments.yes))
+    elif arguments.yes and (found.going or found.resumed or found.worlds):
+        print(_end(found))
+    for line in elsewhere:
+        print(f"enact: {line}", file=sys.stderr)
+    if arguments.yes or arguments.dry_run or not (found.going or found.resumed or found.worlds):
+        return DONE
+    named = ["--unused"] if arguments.unused else found.aspects or found.done
+    words = _command(named, arguments.shard)
+    print(f"enact: nothing was changed; to let it go: {words}", file=sys.stderr)
+    return FAILED
+
+
+def _command(aspects: Iterable[str], shards: Iterable[str] = ()) -> str:
+    only = [word for name in shards for word in ("--shard", name)]
+    return shlex.join(["enact", "shard", "forget", *aspects, *only, "--yes"])
+
+
+def _folders(
+    config: CellConfig, stores: dict[str, str], arguments: argparse.Namespace
+) -> tuple[dict[str, Path], list[str]]:
+    """Return the folders of the shards that have data here, and remarks about the others."""
+    from enact_dist.link.folder.folder import holds_store
+
+    for name in (*stores, *arguments.shard):
+        config.shard(name)
+    folders: dict[str, Path] = {}
+    elsewhere: list[str] = []
+    command = f"`{_command(arguments.aspects)}`"
+    for shard in config.shards:
+        if arguments.shard and shard.name not in arguments.shard:
+            continue
+        folder = Path(stores[shard.name]) if shard.name in stores else shard.folder
+        if folder is None:
+            elsewhere.append(
+                f"shard {shard.name} keeps its data in memory only: it forgets all when it stops"
+            )
+        elif shard.host not in {"", socket.gethostname()} and shard.name not in stores:
+            elsewhere.append(
+                f"shard {shard.name} is on host {shard.host}: run {command} there as well, before"
+                " any shard starts"
+            )
+        elif not holds_store(folder):
+            elsewhere.append(
+                f"shard {shard.name} has no data in {folder}: if it has run on another host, run"
+                f" {command} there as well, before any shard starts"
+            )
+        else:
+            folders[shard.name] = folder
+    if len({folder.resolve() for folder in folders.values()}) < len(folders):
+        raise ConfigError("two shards have the same folder; give each its own with --store")
+    return folders, elsewhere
+
+
+def _facts(found: Forgotten, elsewhere: list[str], *, done: bool) -> dict[str, Any]:
+    return {
+        "done": done,
+        "resumed": found.resumed,
+        "aspects": found.aspects,
+        "worlds": found.worlds,
+        "forgotten_before": found.done,
+        "going": [each._asdict() for each in found.going],
+        "elsewhere": elsewhere,
+    }
+
+
+def _end(found: Forgotten) -> str:
+    slots, versions = sum(g.slots for g in found.going), sum(g.versions for g in found.going)
+    names = ", ".join(found.aspects or found.done)
+    worlds = f"{len(found.worlds)} world contexts without data" if found.worlds else ""
+    if not names:
+        return f"forgot {worlds}; the shards may start"
+    names += f", and {worlds}" if worlds else ""
+    return (
+        f"forgot {names}: {slots} slots with {versions} versions; the shards may start, and take"
+        " whatever type is registered next"
+    )
+
+
+def _shown(size: int) -> str:
+    return shown_bytes(size) if size else "-"
+
+
+class _Told:
+    """Says what goes before it does, and keeps one line of a terminal up to date."""
+
+    def __init__(self, *, as_json: bool, goes: str) -> None:
+        self.line = ProgressLine()
+        self._as_json = as_json
+        self._goes = goes
+
+    def found(self, found: Forgotten) -> None:
+        """Say what goes.
+
+        Raises:
+            MisuseError: No shard here has ever known one of the aspects.
+        """
+        from enact_dist.access.session import unknown_aspect
+
+        self.line.end()
+        for name in found.aspects:
+            if name not in found.known:
+                raise unknown_aspect(name, found.known)
+        if self._as_json:
+            return
+        if found.done:
+            print(f"a run that had forgotten {', '.join(found.done)} was cut off at its end")
+        if found.resumed and (found.aspects or not found.done):
+            print("an earlier run was cut off; this is what it had left")
+        if found.worlds:
+            more = f" and {len(found.worlds) - 10} more" if len(found.worlds) > 10 else ""
+            print(
+                f"{self._goes}: {len(found.worlds)} world contexts without data:"
+                f" {', '.join(found.worlds[:10])}{more}"
+            )
+        if not found.aspects:
+            return
+        print_table(
+            ("shard", "aspect", "type", "slots", "versions", "data", "kept by labels"),
+            [
+                (g.shard, g.aspect, g.type or "-", g.slots, g.versions, _shown(g.size),
+                 f"{g.kept} ({', '.join(g.labels)})" if g.kept else "-")
+                for g in found.going
+            ],
+            empty=f"nothing is here any more of {', '.join(found.aspects)}",
+        )  # fmt: skip
+        if found.going:
+            versions = sum(g.versions for g in found.going)
+            size = sum(g.size for g in found.going)
+            data = f" with {shown_bytes(size)}" if size else ""
+            print(f"{self._goes}: {versions} versions{data}, for good", flush=True)
+
+    def act(self, name: str) -> None:
+        """Show what is done next."""
+        self.line.show(name, at_once=True)

@@ -1,0 +1,194 @@
+"""`enact shard rebalance`: moves entities to where cell.toml places them, while it is stopped."""
+
+from __future__ import annotations
+
+import socket
+import sys
+import time
+from collections import Counter
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.cli.text.output import ProgressLine, print_json, print_table, shown_bytes, shown_s
+from enact_dist.cli.verbs import DONE, add_cell, add_verb, cell_config, pair, pairs
+from enact_dist.errors import ConfigError, StoreError
+
+if TYPE_CHECKING:
+    import argparse
+
+    from enact_dist.cli.verbs import Verb
+    from enact_dist.config.types import CellConfig, ShardConfig
+    from enact_dist.link.offline.rebalance import Rebalance
+
+LISTED_MAX: Final = 20
+"""So many moves are listed one by one for people; `--json` lists all."""
+
+
+def add_to(verbs: argparse._SubParsersAction[Verb]) -> None:
+    """Add the verb."""
+    verb = add_verb(
+        verbs,
+        "rebalance",
+        "move entities to where cell.toml places them, while the cell is stopped",
+        run=run_rebalance,
+        example="enact shard rebalance --cell cell.toml --new third --dry-run\n"
+        "enact shard rebalance --cell cell.toml --store right=/mnt/copy/right\n"
+        "enact shard rebalance --cell cell.toml --store gone=data/gone",
+    )
+    add_cell(verb, file_only=True)
+    verb.add_argument(
+        "--store",
+        action="append",
+        type=pair,
+        metavar="NAME=PATH",
+        help="folder of a shard: a copy of one on another host, or of one that leaves the cell",
+    )
+    verb.add_argument(
+        "--new",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="this shard is new: that it has no data yet is no mistake",
+    )
+    verb.add_argument("--dry-run", action="store_true", help="say what would move, change nothing")
+    verb.add_argument("--json", action="store_true", help="print JSON instead of a table")
+
+
+def run_rebalance(arguments: argparse.Namespace) -> int:
+    """Move what has to be moved; it may be killed at any time and called again."""
+    from enact_dist.link.offline.rebalance import look, rebalance
+
+    config = cell_config(arguments)
+    stores = pairs(arguments.store, "--store")
+    folders = _folders(config, stores, arguments.new)
+    placement = config.placement_map()
+    if arguments.dry_run:
+        found = look(folders, placement)
+    else:
+        progress = _Shown()
+        try:
+            found = rebalance(folders, placement, unix_s=int(time.time()), progress=progress)
+        finally:
+            progress.line.end()
+    if arguments.json:
+        moves = [move._asdict() for move in found.moves]
+        print_json({"done": not arguments.dry_run, "resumed": found.resumed, "moves": moves})
+    else:
+        _print(found, dry_run=arguments.dry_run)
+    _name_others(config, folders)
+    return DONE
+
+
+def _folders(config: CellConfig, stores: dict[str, str], new: list[str]) -> dict[str, Path]:
+    """Return the folder of each shard of the cell, and of each further one that is named.
+
+    Raises:
+        ConfigError: One is not known, or not there and not said to be new.
+    """
+    from enact_dist.link.folder.folder import holds_store
+
+    known = [shard.name for shard in config.shards]
+    for name in new:
+        config.shard(name)
+    folders = {shard.name: _folder(shard, stores, new, config) for shard in config.shards}
+    for name in stores.keys() - set(known):
+        folders[name] = Path(stores[name])
+        if not holds_store(folders[name]):
+            raise ConfigError(f"--store {name}={stores[name]}: no shard has its data there")
+    if len({folder.resolve() for folder in folders.values()}) < len(folders):
+        raise ConfigError("two shards have the same folder; give each its own with --store")
+    return folders
+
+
+def _name_others(config: CellConfig, folders: dict[str, Path]) -> None:
+    """Say where else entities lie: a shard that has left the cell must be named to be emptied."""
+    from enact_dist.link.folder.folder import holds_store
+    from enact_dist.link.offline.backup import ASIDE
+    from enact_dist.link.store.store import read_store
+
+    parent = config.data_folder
+    known = {folder.resolve() for folder in folders.values()}
+    for path in sorted(parent.iterdir()) if parent is not None and parent.is_dir() else ():
+        if path.resolve() in known or not holds_store(path) or ASIDE in path.name:
+            continue
+        with suppress(StoreError), read_store(path) as stored:
+            count = len({record.slot.entity for record in stored.slots})
+            if count:
+                print(
+                    f"enact: {path} has {count} entities of a shard that is not in {config.path};"
+                    f" if it was one of this cell, say --store {path.name}={path}",
+                    file=sys.stderr,
+                )
+
+
+def _folder(shard: ShardConfig, stores: dict[str, str], new: list[str], config: CellConfig) -> Path:
+    from enact_dist.link.folder.folder import holds_store
+
+    name = shard.name
+    folder = Path(stores[name]) if name in stores else shard.folder
+    if folder is None:
+        raise ConfigError(
+            f"{config.path}: shard {name} keeps its data in memory only, so nothing can be moved"
+            " while it is stopped; give it a `folder`, or the cell a `data_folder`"
+        )
+    elsewhere = shard.host not in {"", socket.gethostname()} and name not in stores
+    if elsewhere or (name not in new and not holds_store(folder)):
+        where = f"is on host {shard.host}" if elsewhere else f"has no data in {folder}"
+        raise ConfigError(
+            f"shard {name} {where}: copy its folder here and name it with --store {name}=PATH;"
+            f" if the shard is new, say --new {name}" + (" as well" if elsewhere else "")
+        )
+    return folder
+
+
+def _print(found: Rebalance, *, dry_run: bool) -> None:
+    moves = found.moves
+    versions = sum(move.states for move in moves)
+    total = f"{len(moves)} entities with {versions} versions"
+    if not moves:
+        print("every entity is where it belongs")
+    elif dry_run and len(moves) <= LISTED_MAX:
+        print_table(
+            ("entity", "from", "to", "versions", "data"),
+            [(m.entity, m.source, m.target, m.states, _shown(m.size)) for m in moves],
+            empty="",
+        )
+    else:
+        ways = [(move.source, move.target) for move in moves]
+        sizes: Counter[tuple[str, str]] = Counter()
+        for way, move in zip(ways, moves, strict=True):
+            sizes[way] += move.size
+        rows = [(*way, count, _shown(sizes[way])) for way, count in Counter(ways).items()]
+        print_table(("from", "to", "entities", "data"), rows, empty="")
+    if found.resumed:
+        print("an earlier rebalance was cut off; this is what it had left")
+    if moves:
+        print(f"{'would move' if dry_run else 'moved'} {total}")
+
+
+def _shown(size: int) -> str:
+    return shown_bytes(size) if size else ""
+
+
+class _Shown:
+    """Keeps one line of a terminal up to date."""
+
+    def __init__(self) -> None:
+        self.line = ProgressLine()
+        self._so_far = ""
+
+    def act(self, name: str) -> None:
+        """Show what is done next."""
+        self._show(name)
+
+    def moved(self, entities: int, size: int) -> None:
+        """Show how much is where it belongs."""
+        self._so_far = f"{entities} entities with {shown_bytes(size)} moved; "
+
+    def waits(self, wait_s: float) -> None:
+        """Show what is waited for."""
+        self._show(f"waiting {shown_s(wait_s)} for leases to end")
+
+    def _show(self, text: str) -> None:
+        self.line.show(f"{self._so_far}{text}", at_once=True)

@@ -1,0 +1,1 @@
+"""Text of the command line: tables, values, times and rates, read and written."""

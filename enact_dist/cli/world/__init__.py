@@ -1,0 +1,1 @@
+"""`enact world`, `why` and `impact`: look at world contexts and change them."""

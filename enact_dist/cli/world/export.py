@@ -1,0 +1,142 @@
+"""`enact world export`: one world context as of one moment, as a recording or as a folder of files.
+
+A folder holds for each datum `ENTITY/ASPECT.npy` (an array), `.json` (plain data) or `.npz` with a
+`.json` beside it (arrays with plain data around them), and `index.json`, which names all of them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from enact_dist.cli.record import COMPRESSIONS, shows_of
+from enact_dist.cli.text.output import print_json, shown_bytes
+from enact_dist.cli.text.times import MOMENT_HELP, moment
+from enact_dist.cli.verbs import DONE, add_reader, add_verb, add_world, open_cell, pair
+from enact_dist.errors import ConfigError, EnactError, ProtocolError
+from enact_dist.terms import checked_name
+
+if TYPE_CHECKING:
+    import argparse
+
+    from enact_dist.cli.verbs import Verb
+    from enact_dist.recording.exact import Recorded
+    from enact_dist.world.context import WorldContext
+
+
+def add_export(verbs: argparse._SubParsersAction[Verb]) -> None:
+    """Add the verb to the noun `world`."""
+    export = add_verb(
+        verbs, "export", "write one world context, all of one moment, into a file or folder",
+        run=export_world,
+        example="enact world export online --out online.mcap\n"
+        "enact world export training --at -10min --out training/",
+    )  # fmt: skip
+    add_world(export)
+    export.add_argument(
+        "--out", metavar="FILE|FOLDER", required=True, help="a new FILE.mcap, or a new folder"
+    )
+    export.add_argument("--at", type=moment, metavar="TIME", help=f"as of {MOMENT_HELP}")
+    export.add_argument(
+        "--shows", action="append", type=pair, metavar="ASPECT=KIND", help="as for enact record"
+    )
+    export.add_argument("--compress", choices=COMPRESSIONS, default="zstd", help="of an .mcap file")
+    add_reader(export)
+
+
+def export_world(arguments: argparse.Namespace) -> int:
+    """Write the context and say how much it was."""
+    from enact_dist import recording
+    from enact_dist.access.arguments import stamp_of
+
+    with open_cell(arguments) as cell:
+        world = cell.world(arguments.world)
+        at_ns = stamp_of(arguments.at) if arguments.at is not None else 0
+        if Path(arguments.out).suffix == ".mcap":
+            done = recording.export_world(
+                world,
+                arguments.out,
+                at_ns=at_ns,
+                shows=shows_of(arguments),
+                compression=arguments.compress,
+            )
+            facts = {"path": done.path, "data": done.versions, "size_bytes": done.size_bytes}
+        else:
+            facts = _into_folder(world, Path(arguments.out).expanduser(), at_ns)
+    if arguments.json:
+        print_json(facts)
+    else:
+        size = shown_bytes(int(str(facts["size_bytes"])))
+        print(f"{arguments.world}: {facts['data']} data, {size} in {facts['path']}")
+    return DONE
+
+
+def _into_folder(world: WorldContext, folder: Path, at_ns: int) -> dict[str, object]:
+    """Write each datum as files of common formats; nothing is written over."""
+    from enact_dist.recording.exporting import world_as_of
+
+    try:
+        folder.mkdir(parents=True)
+    except FileExistsError:
+        raise ConfigError(
+            f"{folder} exists; an export makes a new folder, or a file that ends in .mcap"
+        ) from None
+    try:
+        index = [_save(version, folder) for version in world_as_of(world, at_ns)]
+    except EnactError:
+        with contextlib.suppress(OSError):  # of a folder that has data by now
+            folder.rmdir()
+        raise
+    (folder / "index.json").write_text(json.dumps(index, indent=2), encoding="utf-8")
+    size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+    return {"path": str(folder), "data": len(index), "size_bytes": size}
+
+
+def _checked_names(version: Recorded) -> tuple[str, str]:
+    """Return the names of an entity and an aspect that may become those of files.
+
+    Raises:
+        ProtocolError: A shard has told a name that no client can have made.
+    """
+    _, entity, aspect = version.slot
+    try:
+        checked_name("entity", entity, slashes=True)
+        checked_name("aspect", aspect, slashes=False)
+    except ValueError as error:
+        raise ProtocolError(
+            f"shard {version.shard!r} sent a name that leads out of the folder or is not a valid"
+            f" file name: {error}; nothing was written for it"
+        ) from None
+    return entity, aspect
+
+
+def _save(version: Recorded, folder: Path) -> dict[str, object]:
+    """Write one datum; return its line of the index."""
+    import numpy as np
+
+    from enact_dist.cli.text import showing
+    from enact_dist.wire.payload import decode_untyped
+
+    assert version.datum is not None, "an export has no null"
+    value: Any = decode_untyped(version.datum)
+    entity, aspect = _checked_names(version)
+    place = folder / entity
+    place.mkdir(parents=True, exist_ok=True)
+    if isinstance(value, np.ndarray):
+        suffixes = [".npy"]
+    else:
+        suffixes = [".npz", ".json"] if showing.has_arrays(value) else [".json"]
+    for suffix in suffixes:
+        whole = suffix != ".json" or suffixes == [".json"]
+        showing.save(value if whole else showing.plain(value), str(place / f"{aspect}{suffix}"))
+    return {
+        "entity": entity,
+        "aspect": aspect,
+        "version": version.version,
+        "stamp_ns": version.stamp_ns,
+        "captured_ns": version.captured_ns,
+        "shard": version.shard,
+        "files": [f"{entity}/{aspect}{suffix}" for suffix in suffixes],
+    }

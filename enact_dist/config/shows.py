@@ -1,0 +1,193 @@
+"""What the data of an aspect look like, and in which frame: said by the cell, or guessed by shape.
+
+::
+
+    [aspects.observation]
+    shows = ["image", "calibration", "transform"]     # or one: shows = "point_cloud"
+    frame = "camera/{2}"                              # or by entity: { "view/**" = "{entity}", … }
+    parent = "tray"
+
+===============  ================================================================================
+kind             takes the first part of the datum, in the order of its fields, that is
+===============  ================================================================================
+``image``        an array (H, W), (H, W, 3) or (H, W, 4) of uint8; (H, W) of uint16 or float32
+``mask``         an array (H, W) of bool or uint8, shown as 0 and 255; in a field ``packed`` the
+                 bits of an array (H, W / 8) of uint8 (`numpy.packbits` along the rows)
+``point_cloud``  an array (N, 3) of floats, metres; with colours if an (N, 3) of uint8 stands beside
+``mesh``         an array (N, 3) of floats, metres, and beside it an (M, 3) of integers
+``voxels``       an array (N, 3) of integers, indices of occupied voxels: the cubes' outer faces.
+                 ``voxel_m`` and ``origin_m`` (the grid's lowest corner) stand beside it or in the
+                 aspect's table
+``capsules``     an array (N, 7) of floats, metres: centre of one end, of the other, radius
+``joints``       an array (J,) of floats, positions of joints in rad or m, or (T, J), of which the
+                 last row counts; velocities if a second one of that shape stands beside; names from
+                 ``joints = ["…", …]`` in the aspect's table, else ``joint_1`` …
+``pose``         a rigid (4, 4), metres: where the thing is in ``frame``
+``transform``    a rigid (4, 4), metres: where ``frame`` is in ``parent``; with ``inverse = true``
+                 in the aspect's table: where ``parent`` is in ``frame``
+``calibration``  a pinhole camera: ``width_px height_px fx_px fy_px cx_px cy_px``, or
+                 ``camera_matrix`` (3, 3), ``width`` and ``height``, with ``distortion`` if there is
+``json``         anything; long arrays only with dtype and shape
+===============  ================================================================================
+
+``of = "acquisition.camera"`` starts at that part instead; ``encoding = "bgr8"`` names the colours
+of an image (``rgb8``, ``rgba8``, ``mono8``, ``16UC1`` and ``32FC1`` by shape and dtype).  In a
+frame ``{entity}`` stands for the entity's name and ``{1}``, ``{2}`` … for its segments; without a
+frame the entity's name is used.
+
+Nothing said: an array (H, W, 3) or (H, W, 4) of uint8 is an image, a rigid (4, 4) a pose, a
+dataclass with ``points_m`` a cloud, with ``vertices_m`` and ``triangles`` a mesh, with ``voxels``
+and ``voxel_m`` voxels, the rest JSON.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.errors import ConfigError
+from enact_dist.patterns import pattern_matches
+from enact_dist.terms import Entities
+
+if TYPE_CHECKING:
+    from enact_dist.config.table import Table
+
+KINDS: Final = (
+    "image",
+    "mask",
+    "point_cloud",
+    "mesh",
+    "voxels",
+    "capsules",
+    "joints",
+    "pose",
+    "transform",
+    "calibration",
+    "json",
+)
+ENCODINGS: Final = ("rgb8", "bgr8", "rgba8", "bgra8", "mono8", "mono16", "16UC1", "32FC1")
+
+SHOWS_KEYS: Final = (
+    "shows", "frame", "parent", "of", "encoding", "voxel_m", "origin_m", "joints", "inverse",
+)  # fmt: skip
+"""Keys of an aspect's table that say what it shows."""
+
+VOXEL_M_MAX: Final = 1000.0
+
+_PLACE: Final = re.compile(r"\{(entity|[1-9][0-9]?)\}")
+
+Frames = str | Mapping[str, str]
+"""A frame's name, or one per pattern of entities."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shows:
+    """What the data of one aspect are shown as.
+
+    Args:
+        kinds: What to show of each datum; none: guessed by its shape.
+        frame: Coordinate frame of the data; see above.
+        parent: For a transform: the frame in which ``frame`` lies.
+        of: Dotted path of the part to look at; the whole datum unless given.
+        encoding: Of an image's pixels; by shape and dtype unless given.
+        voxel_m: Edge of a voxel where the datum does not say it; 0: it has to.
+        origin_m: Lowest corner of the grid of voxels where the datum does not say it.
+        joints: Names of joints, in order.
+        inverse: A transform says where the parent is in the frame.
+
+    Raises:
+        ConfigError: A kind or encoding is unknown, a pattern or frame is written wrongly.
+    """
+
+    kinds: tuple[str, ...] = ()
+    frame: Frames = ""
+    parent: Frames = ""
+    of: str = ""
+    encoding: str = ""
+    voxel_m: float = 0.0
+    origin_m: tuple[float, ...] = (0.0, 0.0, 0.0)
+    joints: tuple[str, ...] = ()
+    inverse: bool = False
+
+    def __post_init__(self) -> None:
+        for kind in self.kinds:
+            if kind not in KINDS:
+                raise ConfigError(f"unknown kind of display {kind!r}; known: {', '.join(KINDS)}")
+        if self.encoding and self.encoding not in ENCODINGS:
+            known = ", ".join(ENCODINGS)
+            raise ConfigError(f"unknown encoding {self.encoding!r} of an image; known: {known}")
+        if len(self.origin_m) != 3:
+            raise ConfigError(
+                f"origin_m is the place of a corner, three numbers, not {self.origin_m}"
+            )
+        if "transform" in self.kinds and not self.parent:
+            raise ConfigError("a transform needs the frame in which it lies: parent = '…'")
+        for frames in (self.frame, self.parent):
+            _check_frames(frames)
+
+    def frame_of(self, entity: str) -> str:
+        """Return the frame of the data of an entity."""
+        return _frame(self.frame, entity) or entity
+
+    def parent_of(self, entity: str) -> str:
+        """Return the frame in which an entity's frame lies; "" if none is said for it."""
+        return _frame(self.parent, entity)
+
+
+def _check_frames(frames: Frames) -> None:
+    for pattern, text in ({"**": frames} if isinstance(frames, str) else frames).items():
+        try:
+            Entities(pattern)
+        except ValueError as error:
+            raise ConfigError(f"frames are said per pattern of entities: {error}") from None
+        if not isinstance(text, str) or set("{}") & set(_PLACE.sub("", text)):
+            raise ConfigError(f"{text!r} names no frame; it may hold {{entity}}, {{1}}, {{2}} …")
+
+
+def _frame(frames: Frames, entity: str) -> str:
+    """Return the frame of the first pattern that covers the entity, filled in."""
+    by_pattern = {"**": frames} if isinstance(frames, str) else frames
+    for pattern, text in by_pattern.items():
+        if pattern_matches(pattern, entity):
+            return _PLACE.sub(lambda place: _segment(place[1], entity), text)
+    return ""
+
+
+def _segment(name: str, entity: str) -> str:
+    if name == "entity":
+        return entity
+    segments = entity.split("/")
+    number = int(name)
+    return segments[number - 1] if number <= len(segments) else ""
+
+
+GUESSED: Final = Shows()
+"""The default for aspects that the configuration does not mention."""
+
+
+def take_shows(table: Table) -> Shows:
+    """Return what the table of an aspect in a `cell.toml` says.
+
+    Raises:
+        ConfigError: It says something that cannot be used; the message names the line.
+    """
+    kinds = table.take_strings("shows")
+    frame, parent = _take_frames(table, "frame"), _take_frames(table, "parent")
+    of, encoding = table.take_str("of", ""), table.take_str("encoding", "")
+    voxel_m = table.take_float("voxel_m", 0.0, low=0.0, high=VOXEL_M_MAX)
+    origin_m = table.take_floats("origin_m", (0.0, 0.0, 0.0))
+    joints, inverse = table.take_strings("joints"), table.take_bool("inverse", default=False)
+    try:
+        return Shows(kinds, frame, parent, of, encoding, voxel_m, origin_m, joints, inverse)
+    except ConfigError as error:
+        key = next((key for key in SHOWS_KEYS if key in table.values), "shows")
+        table.refuse(key, f"in {table.title} {error}")
+
+
+def _take_frames(table: Table, key: str) -> Frames:
+    if not isinstance(table.values.get(key), dict):
+        return table.take_str(key, "")
+    by_pattern = table.take_table(key)
+    return {pattern: by_pattern.take_str(pattern) for pattern in by_pattern.values}

@@ -1,0 +1,288 @@
+"""What a cell consists of, as frozen values: the result of reading a `cell.toml`.
+
+`enact_dist.config.read` reads them; everything else only looks at them.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import zlib
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.config.shows import GUESSED, Shows
+from enact_dist.core.protocol.messages import AspectEntry, Pin, PlacementMap, ShardEntry
+from enact_dist.core.state.retention import said
+from enact_dist.errors import ConfigError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+    from pathlib import Path
+
+    from enact_dist.core.shard.state import ShardSettings
+    from enact_dist.retention import Retention
+    from enact_dist.terms import Durability
+
+CARRIERS: Final = ("auto", "zenoh", "socket")
+"""How messages may travel between processes; `local()` needs none of them.
+
+"auto" takes a socket between processes of one host and Zenoh for all others; "socket" makes it an
+error if there is none.
+"""
+
+TTL_S_MIN: Final = 0.2
+"""Shorter leases end in ordinary scheduling pauses of a loaded machine."""
+TTL_S_MAX: Final = 60.0
+"""A dead holder blocks its data for one TTL, a restarted shard waits one for absent sessions."""
+DRAIN_S_MAX: Final = 3600.0
+"""Default duration of `enact lock hold`."""
+
+_ENDPOINT: Final = re.compile(r"tcp/(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):(\d{1,5})\Z")
+_ADDRESS: Final = re.compile(r"((\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)?:)?\d{1,5}\Z")
+_WILDCARDS: Final = ("0.0.0.0", "[::]")  # noqa: S104 - recognised here in order to be refused
+
+
+def checked_endpoint(endpoint: str) -> str:
+    """Return `endpoint` if it has the form ``tcp/host:port``.
+
+    Raises:
+        ValueError: It has another form, or a port outside 1 to 65535.
+    """
+    found = _ENDPOINT.match(endpoint)
+    if found is None or not 1 <= int(found[2]) <= 65_535:
+        raise ValueError(
+            f"{endpoint!r} is no endpoint; write tcp/host:port with a port from 1 to 65535,"
+            " such as tcp/127.0.0.1:7447"
+        )
+    return endpoint
+
+
+def metrics_address(text: str) -> tuple[str, int]:
+    """Read ``host:port``, or a port of the loopback.
+
+    Raises:
+        ValueError: It has another form, or a port outside 1 to 65535.
+    """
+    host, _, port = text.rpartition(":")
+    if not _ADDRESS.match(text) or not 1 <= int(port) <= 65_535:
+        raise ValueError(
+            f"{text!r} is no address for metrics; write host:port, or a port of the loopback, such"
+            " as 127.0.0.1:9464 or 9464"
+        )
+    return host.strip("[]") or "127.0.0.1", int(port)
+
+
+def is_wildcard(endpoint: str) -> bool:
+    """Return whether an endpoint means every address of a host; no client can connect to that."""
+    found = _ENDPOINT.match(endpoint)
+    return found is not None and found[1] in _WILDCARDS
+
+
+TTL_S_DEFAULT: Final = 2.0
+"""Session TTL in seconds: a dead holder blocks others that long; shorter needs a quiet network."""
+
+CARRIER_DEFAULT: Final = "auto"
+
+
+@dataclass(frozen=True, slots=True)
+class ShardConfig:
+    """One shard daemon.
+
+    Attributes:
+        name: Its name in the cell.
+        listen: Endpoints it opens (``tcp/0.0.0.0:7447``).
+        advertise: Endpoints at which others reach it; those of `listen` unless written.
+        folder: Its data folder, absolute, or ``None`` to keep everything in memory.
+        host: Host name of the machine it runs on; empty: wherever `enact up` is called.
+        metrics: Host and port at which Prometheus may ask, or ``None``.
+        drain_s: How long holders may still finish after a signal, seconds; ``None`` leaves it to
+            the daemon.
+    """
+
+    name: str
+    listen: tuple[str, ...]
+    advertise: tuple[str, ...]
+    folder: Path | None
+    host: str = ""
+    metrics: tuple[str, int] | None = None
+    drain_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class AspectConfig:
+    """What the cell fixes about an aspect.
+
+    Attributes:
+        name: Name of the aspect.
+        durability: What its commits survive; wins over the actors' own word.  None leaves it to
+            them.
+        retention: How much of each datum's history stays; None leaves it to the actors.
+        compare: What a command line compares its data by, ``package.module:NAME``, or nothing.
+        shows: What a recording shows its data as.
+    """
+
+    name: str
+    durability: Durability | None = None
+    retention: Retention | None = None
+    compare: str = ""
+    shows: Shows = GUESSED
+
+    def entry(self) -> AspectEntry:
+        """Return it as an entry of a catalogue, without a fingerprint: any type may register."""
+        durability = self.durability.value if self.durability is not None else ""
+        return AspectEntry(self.name, "", durability, *said(self.retention))
+
+
+@dataclass(frozen=True, slots=True)
+class ActorConfig:
+    """One actor process.
+
+    Attributes:
+        name: Its name in the cell.
+        class_path: ``package.module:Class``.
+        worlds: Role of the actor class to world context of the cell.
+        options: Parameters of the class (`args`), as TOML gives them.
+        env: Environment variables of its process.
+        process: Name of the operating system process that it shares with others; empty: it has
+            one of its own.
+        every_s: Period in seconds that replaces the one of a source, or ``None``.
+        entity: The one entity that it works on, of those that its patterns match; empty: all.
+        host: Host name of the machine it runs on; empty: wherever `enact up` is called.
+        drain_s: How long its update may still take after a signal, seconds; ``None`` leaves it to
+            the actor's process.
+    """
+
+    name: str
+    class_path: str
+    worlds: Mapping[str, str]
+    options: Mapping[str, object]
+    every_s: float | None = None
+    entity: str = ""
+    host: str = ""
+    drain_s: float | None = None
+    env: Mapping[str, str] = field(default_factory=dict)
+    process: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ActorProcess:
+    """One operating system process with its actors.
+
+    Attributes:
+        name: `process` of its actors; of an actor that has a process of its own, that actor's name.
+        actors: Its actors, at least one, in the order of the file.
+    """
+
+    name: str
+    actors: tuple[ActorConfig, ...]
+
+    @property
+    def env(self) -> Mapping[str, str]:
+        """Environment variables of the process: those of all its actors."""
+        return {name: text for actor in self.actors for name, text in actor.env.items()}
+
+    @property
+    def drain_s(self) -> float | None:
+        """The longest `drain_s` of its actors; ``None`` where no actor has one."""
+        return max((one.drain_s for one in self.actors if one.drain_s is not None), default=None)
+
+    @property
+    def members(self) -> tuple[str, ...]:
+        """Names of its actors."""
+        return tuple(actor.name for actor in self.actors)
+
+
+@dataclass(frozen=True, slots=True)
+class CellConfig:
+    """A whole cell.
+
+    Attributes:
+        path: The file it was read from, absolute.
+        name: Name of the cell; part of every key on the network.
+        ttl_s: Session TTL in seconds.
+        carrier: How messages travel between processes.
+        shared_bytes_max: Cap of each shard's large data in shared memory, bytes.
+        data_folder: Where shards without a `folder` of their own keep theirs, or ``None``.
+        worlds: World contexts that exist from the start.
+        shards: At least one, in the order of the file.
+        pins: Entities kept on one shard; the first pin that matches wins.
+        aspects: Aspects whose durability is fixed here.
+        actors: Actors of the cell, in the order of the file.
+    """
+
+    path: Path
+    name: str
+    ttl_s: float
+    carrier: str
+    shared_bytes_max: int | None
+    data_folder: Path | None
+    worlds: tuple[str, ...]
+    shards: tuple[ShardConfig, ...]
+    pins: tuple[Pin, ...] = ()
+    aspects: tuple[AspectConfig, ...] = ()
+    actors: tuple[ActorConfig, ...] = ()
+
+    @property
+    def ttl_ns(self) -> int:
+        """Session TTL in nanoseconds."""
+        return round(self.ttl_s * 1e9)
+
+    def shard(self, name: str) -> ShardConfig:
+        """Return the shard called `name`.
+
+        Raises:
+            ConfigError: The cell has none of that name.
+        """
+        for shard in self.shards:
+            if shard.name == name:
+                return shard
+        known = ", ".join(shard.name for shard in self.shards)
+        raise ConfigError(
+            f"{self.path}: the cell {self.name} has no shard {name!r}; it has {known}",
+            path=str(self.path),
+        )
+
+    def processes(self) -> tuple[ActorProcess, ...]:
+        """Return the processes of the cell's actors, in the order of their first actors."""
+        return processes_of(self.actors)
+
+    def placement_map(self) -> PlacementMap:
+        """Return the shards with their advertised endpoints, and the pins.
+
+        The version is a checksum of what decides where an entity lives, the shard names and the
+        pins in order: the same file has the same version on every host and after every restart,
+        and an endpoint that differs between hosts does not make their maps disagree.
+        """
+        text = json.dumps([sorted(shard.name for shard in self.shards), self.pins])
+        version = zlib.crc32(text.encode()) & 0x7FFF_FFFF
+        shards = tuple(ShardEntry(shard.name, shard.advertise) for shard in self.shards)
+        return PlacementMap(version, shards, self.pins)
+
+    def aspect_entries(self) -> tuple[AspectEntry, ...]:
+        """Return the aspects as entries of a catalogue."""
+        return tuple(aspect.entry() for aspect in self.aspects)
+
+    def shard_settings(self, name: str) -> ShardSettings:
+        """Return what the core of shard `name` has to know.
+
+        Raises:
+            ConfigError: The cell has none of that name.
+        """
+        from enact_dist.core.shard.state import ShardSettings
+
+        return ShardSettings(
+            name=self.shard(name).name,
+            placement=self.placement_map(),
+            worlds=self.worlds,
+            aspects=self.aspect_entries(),
+            ttl_ns_max=self.ttl_ns,
+        )
+
+
+def processes_of(actors: Iterable[ActorConfig]) -> tuple[ActorProcess, ...]:
+    """Return the processes in which these actors run, in the order of their first actors."""
+    found: dict[tuple[bool, str], list[ActorConfig]] = {}
+    for actor in actors:
+        found.setdefault((not actor.process, actor.process or actor.name), []).append(actor)
+    return tuple(ActorProcess(name, tuple(those)) for (_, name), those in found.items())

@@ -1,0 +1,1 @@
+"""A client: locks over several shards, leases as the client believes them, commits."""

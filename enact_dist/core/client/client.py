@@ -1,0 +1,114 @@
+"""The client half of the protocol: one session of a process over all shards, and its locks.
+
+A lock is begun under a plan, which splits what was requested by shard.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.core.client.lock import MultiLock
+from enact_dist.core.client.plan import Phase, Plan
+from enact_dist.core.client.session import ClientSession
+from enact_dist.core.protocol.datum import LockId
+from enact_dist.core.protocol.placement import shard_of
+from enact_dist.terms import ACCESSES, Access
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from enact_dist.core.protocol.messages import Item, PlacementMap
+
+PLANNED_MAX: Final = 32
+PLANS_MAX: Final = 256
+"""Sets of so few requested items, at most so many, whose split by shard is remembered."""
+
+
+class Client(ClientSession[MultiLock]):
+    """The session of one process, over all shards, which begins locks."""
+
+    __slots__ = ("_plans",)
+
+    def __init__(
+        self,
+        session: str,
+        *,
+        ttl_ns: int,
+        actor: str = "",
+        host: str = "",
+        pid: int = 0,
+        observer: bool = False,
+    ) -> None:
+        super().__init__(session, ttl_ns=ttl_ns, actor=actor, host=host, pid=pid, observer=observer)
+        self._plans: dict[tuple[Item, ...], Plan] = {}
+
+    def begin(self, lane: int, plan: Plan, *, now_ns: int, wait_ns: int, hold_ns: int) -> MultiLock:
+        """Start a lock of one thread under a new seq."""
+        seq = self._seqs[lane] = self._seqs.get(lane, 0) + 1
+        lock = LockId(self.session, lane, seq)
+        multilock = MultiLock(self, lock, plan, now_ns + wait_ns, hold_ns)
+        if multilock.phase.busy:
+            self._locks[lock] = multilock
+        return multilock
+
+    def live_locks(self) -> list[MultiLock]:
+        """Return the locks that are not at rest."""
+        return list(self._locks.values())
+
+    def learn_placement(self, placement: PlacementMap) -> None:
+        """Take over the shard's placement map; where shards differ, the newest answer counts."""
+        self._plans.clear()
+        super().learn_placement(placement)
+
+    def plan(self, items: Iterable[Item], *, lock_views: bool = False, past_ns: int = 0) -> Plan:
+        """Split requested items by shard, in the one global order of acquisition.
+
+        A pattern goes to every shard.  Views ride with the locks where one shard has them all,
+        unless it may not show a commit of ours yet.  With `lock_views` they become reads.  With
+        `past_ns` they are views alone, as of that stamp.
+        """
+        items = tuple(items)
+        usual = not lock_views and not self.unsettled and len(items) <= PLANNED_MAX
+        plan = self._plans.get(items) if usual else None
+        if plan is None:
+            plan = self._planned(items, lock_views=lock_views)
+            if usual and not any(item.captured_ns for item in items):  # a stamp is asked once
+                if len(self._plans) >= PLANS_MAX:
+                    self._plans.clear()
+                self._plans[items] = plan
+        if past_ns:
+            return Plan(plan.locks, plan.views, plan.placement, plan.floor_ns, past_ns)
+        return plan
+
+    def _planned(self, items: Iterable[Item], *, lock_views: bool) -> Plan:
+        locks: dict[str, list[Item]] = {}
+        views: dict[str, list[Item]] = {}
+        every = [shard.name for shard in self.placement.shards]
+        for item in items:
+            access = ACCESSES[item.access]
+            if lock_views and not access.locks:
+                access = Access.READ_EACH if access.each else Access.READ
+                item = item._replace(access=access)  # noqa: PLW2901 - the same, but locked
+            shards = every if access.each else [shard_of(item.entity, self.placement)]
+            for shard in shards:
+                (locks if access.locks else views).setdefault(shard, []).append(item)
+        if len(locks) == 1:
+            only = next(iter(locks))
+            here = views.get(only, ())
+            if set(views) <= {only} and not self.unsettled.stamp_ns(only, here):
+                locks[only] += views.pop(only, [])
+        return Plan(
+            tuple([(shard, tuple(locks[shard])) for shard in sorted(locks)]),
+            tuple([(shard, tuple(views[shard])) for shard in sorted(views)]),
+            self.placement,
+            max((self.unsettled.stamp_ns(shard, views[shard]) for shard in views), default=0),
+        )
+
+    def assert_invariants(self) -> None:
+        """Assert the bookkeeping of all locks.  For tests and simulation."""
+        lanes = [lock.lane for lock in self._locks]
+        assert len(lanes) == len(set(lanes)), "two live locks in one lane"
+        for lock_id, lock in self._locks.items():
+            assert lock.lock == lock_id
+            assert lock.phase.busy or lock.phase is Phase.HELD, lock.phase
+            assert lock_id.seq <= self._seqs[lock_id.lane]

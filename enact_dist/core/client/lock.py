@@ -1,0 +1,500 @@
+"""The client half of one lock: acquire over shards in order, hold, finish, give up.
+
+::
+
+    ACQUIRING ──> VIEWING ──> HELD ──> VALIDATING ──> COMMITTING ──> COMMITTED
+                                       (preparing)
+        │            │          │           │              │
+        └────────────┴──────────┴───────────┴──────────────┴──> LOST · TIMED_OUT · UNREACHABLE ·
+                                                                REFUSED · UNKNOWN · RELEASED
+
+Rules a change must keep
+  * Shards are acquired in one global order (by name), waiting at one at a time: waits-for edges
+    over shards only go up, so there is no deadlock.
+  * Reads and expectations on other shards are validated, writes prepared, after `finish` and
+    before the commit: everything was then held at the moment of `finish`.
+  * Until the commit is sent, giving up means abort: releasing the primary causes it.
+  * No answer means unknown.  A commit without an answer is asked about (`Outcome`), never guessed.
+  * A `Stale` or lost lock never comes back under its seq.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.core.client.cut import ROUNDS_MAX, Cut
+from enact_dist.core.client.finishing import Finishing, by_shard, tokens_of
+from enact_dist.core.client.plan import OF_SESSIONS, Part, Phase, Plan, Reading, first_asking
+from enact_dist.core.protocol.checks import NO_PAYLOAD
+from enact_dist.core.protocol.messages import (
+    OUTCOME_COMMITTED,
+    OUTCOME_EXPIRED,
+    OUTCOME_PENDING,
+    Acquire,
+    Answer,
+    Changed,
+    Commit,
+    Committed,
+    EpochChanged,
+    Fenced,
+    Forgotten,
+    Granted,
+    Outcome,
+    OutcomeIs,
+    Prepare,
+    Prepared,
+    Refused,
+    Release,
+    Stale,
+    TakeView,
+    Valid,
+    Validate,
+    Viewed,
+    Waiting,
+    WrongShard,
+)
+from enact_dist.core.protocol.placement import shard_of
+from enact_dist.errors import SHARD_RESTARTED
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from enact_dist.core.client.session import ClientSession
+    from enact_dist.core.protocol.datum import LockId, Position, Slot
+    from enact_dist.core.protocol.messages import DatumRead, Holder, Request, SlotVersion, WriteItem
+
+WAIT_SLICE_NS: Final = 900_000_000
+"""How long one call of a waiting lock is parked; below the shard's own limit of 1 s."""
+RETRY_NS_MIN: Final = 20_000_000
+RETRY_NS_MAX: Final = 300_000_000
+"""Pause after a call without an answer; doubles up to the second figure."""
+OVERLOAD: Final = "overload"
+"""The code of refusals by a shard that has not looked at the request."""
+_TO_ANY_REQUEST: Final = (Refused, Forgotten, WrongShard, EpochChanged)  # a union is slower
+_DECIDERS: Final = (Commit, Outcome)
+
+FREE_CALLS: Final = 3
+"""Calls after a step forward that are made though the time to wait is over: a lock that does not
+want to wait asks each shard once, and again where a shard has restarted."""
+
+
+@dataclass(slots=True, eq=False)
+class MultiLock:
+    """One lock of one thread.  Driven by `next_calls` and `answered`; time comes in as argument."""
+
+    client: ClientSession[MultiLock]
+    lock: LockId
+    plan: Plan
+    give_up_ns: int
+    hold_ns: int
+    phase: Phase = Phase.ACQUIRING
+    cause: str = ""
+    refusal: Refused | Forgotten | None = None
+    moved: SlotVersion | None = None
+    silent_shard: str = ""
+    blockers: tuple[Holder, ...] = ()
+    taken_from: Part | None = None
+    position: Position | None = None
+    versions: tuple[SlotVersion, ...] = ()
+    states: list[Reading] = field(default_factory=list)
+    parts: list[Part] = field(default_factory=list)
+    slice_ns: int = WAIT_SLICE_NS
+    lane_free: bool = False
+    farewells: list[tuple[str, Request]] = field(default_factory=list)
+    cut: Cut | None = None
+    _finishing: Finishing | None = None
+    _free_calls: int = FREE_CALLS
+    _retry_at_ns: int = 0
+    _retry_ns: int = RETRY_NS_MIN
+
+    def __post_init__(self) -> None:
+        self.parts = [Part(shard, items) for shard, items in self.plan.locks]
+        if self.plan.views:
+            self.cut = Cut.of(self.plan, observer=self.client.observer)
+        if not self.parts:
+            self._advance()
+
+    # ---------------------------------------------------------------- what to send
+
+    def next_calls(self, now_ns: int) -> tuple[list[tuple[str, Request]], int]:
+        """Return the calls to make now; without any, the time until which to wait.
+
+        Every returned call must be followed by one `answered`.
+        """
+        if not self.phase.busy:
+            return [], 0
+        if now_ns >= self.give_up_ns and not self._free_calls:
+            self._gives_up()
+            return [], 0
+        if now_ns < self._retry_at_ns:
+            return [], min(self._retry_at_ns, self.give_up_ns)
+        calls = self._calls(now_ns)
+        strangers: dict[str, None] = {}
+        for shard, _ in calls:
+            if self.client.needs_hello(shard):
+                strangers[shard] = None
+        return [(shard, self.client.hello(shard)) for shard in strangers] if strangers else calls, 0
+
+    def _calls(self, now_ns: int) -> list[tuple[str, Request]]:
+        if self.phase is Phase.ACQUIRING:
+            return [self._acquire(now_ns)]
+        if self.cut is not None and self.phase is Phase.VIEWING:
+            return [(shard, self._view(shard, self.cut, now_ns)) for shard in self.cut.left]
+        finishing = self._finishing
+        assert finishing is not None
+        if self.phase is Phase.VALIDATING:
+            return finishing.votes_to_ask(self.client.seen_stamp_ns)
+        if finishing.ask_outcome:
+            return [(finishing.primary, Outcome(self.lock))]
+        finishing.sent = True
+        return [(finishing.primary, finishing.commit(self.client.seen_stamp_ns))]
+
+    def _acquire(self, now_ns: int) -> tuple[str, Request]:
+        part = first_asking(self.parts)
+        assert part is not None
+        left_ns = max(0, self.give_up_ns - now_ns)
+        last = part is self.parts[-1]
+        # The hold limit counts from the last grant; earlier ones must outlast the waiting too.
+        hold_ns = self.hold_ns if last else self.hold_ns + left_ns
+        return part.shard, Acquire(
+            self.lock,
+            self.client.epoch(part.shard),
+            self.plan.placement.version,
+            self.client.sendings.next(now_ns),
+            part.items,
+            min(self.slice_ns, left_ns),
+            hold_ns,
+            self.client.seen_stamp_ns,
+            alone=len(self.parts) == 1 and not self.plan.views,
+            successions=self.client.successions(part.shard),
+        )
+
+    def _view(self, shard: str, cut: Cut, now_ns: int) -> Request:
+        client, map_version = self.client, self.plan.placement.version
+        count = client.sendings.next(now_ns)
+        epoch, seen_ns = client.epoch(shard), client.seen_stamp_ns
+        return TakeView(
+            self.lock, epoch, map_version, count, cut.items[shard], seen_ns, cut.at_ns, cut.strict
+        )
+
+    def take_farewells(self) -> list[tuple[str, Request]]:
+        """Return releases to send once; their answers do not matter, and lost ones are repaired."""
+        farewells, self.farewells = self.farewells, []
+        return farewells
+
+    # ---------------------------------------------------------------- what came back
+
+    def answered(self, shard: str, request: Request, answer: Answer | None, now_ns: int) -> None:
+        """Take the answer to one call (None: unknown)."""
+        if answer is None or (isinstance(answer, Refused) and self._undecided(request, answer)):
+            self._silent(shard, request, now_ns)
+            return
+        if isinstance(answer, OF_SESSIONS) and self.client.answered(shard, request, answer, now_ns):
+            return  # it was about the session, not about this lock
+        if self.silent_shard == shard:
+            self.silent_shard = ""
+        self._retry_ns = RETRY_NS_MIN
+        if isinstance(answer, _TO_ANY_REQUEST):
+            self._on_refusal(shard, request, answer)
+        elif getattr(answer, "lock", None) != self.lock:
+            return
+        elif self.phase is Phase.ACQUIRING:
+            self._on_acquiring(shard, answer, now_ns)
+        elif self.phase is Phase.COMMITTING:
+            if isinstance(request, _DECIDERS):
+                self._on_committing(answer, now_ns)
+        elif isinstance(answer, Viewed) and isinstance(request, TakeView):
+            self._on_viewed(shard, request, answer, now_ns)
+        elif self.phase is Phase.VALIDATING and isinstance(request, Validate | Prepare):
+            self._on_vote(shard, answer)
+
+    def _on_refusal(
+        self, shard: str, request: Request, answer: Refused | Forgotten | WrongShard | EpochChanged
+    ) -> None:
+        if isinstance(answer, Forgotten) and isinstance(self.refusal, Forgotten):
+            self.refusal = max(answer, self.refusal, key=lambda each: each.oldest_ns)
+        elif isinstance(answer, Refused | Forgotten):
+            code = answer.code if isinstance(answer, Refused) else ""
+            if code == NO_PAYLOAD and self._finishing and self._finishing.unname(request):
+                return  # asked again, with the bytes
+            self._end(Phase.REFUSED)
+            self.refusal = answer
+        elif isinstance(answer, WrongShard):
+            self.client.learn_placement(answer.placement)
+            self._end(Phase.MISPLACED)
+        else:
+            self._epoch_changed(shard, request)
+
+    def _undecided(self, request: Request, answer: Refused) -> bool:
+        """Whether it is a refusal that leaves open what became of a commit that was sent.
+
+        Refusing the commit itself ends its lock, but a shard that is too busy has not looked at
+        it: an earlier copy may have been applied, or still be.
+        """
+        if self.phase is not Phase.COMMITTING or not self.sent_commit:
+            return False
+        return not isinstance(request, Commit) or answer.code == OVERLOAD
+
+    def _silent(self, shard: str, request: Request, now_ns: int) -> None:
+        self.silent_shard = shard
+        self._free_calls = 0
+        if isinstance(request, _DECIDERS) and self._finishing is not None:
+            self._finishing.ask_outcome, self._finishing.pending = True, False
+        self._pause(now_ns)
+
+    def _pause(self, now_ns: int) -> None:
+        self._retry_at_ns = now_ns + self._retry_ns
+        self._retry_ns = min(2 * self._retry_ns, RETRY_NS_MAX)
+
+    def ask_again(self) -> None:
+        """Make the next call without a further pause."""
+        self._retry_at_ns, self._retry_ns = 0, RETRY_NS_MIN
+
+    def _epoch_changed(self, shard: str, request: Request) -> None:
+        """The shard restarted or forgot the session; `client` has dropped our grants there."""
+        self._free_calls = max(0, self._free_calls - 1)
+        finishing = self._finishing
+        if isinstance(request, _DECIDERS) and finishing is not None:
+            finishing.ask_outcome = True
+        elif isinstance(request, Validate | Prepare) and finishing and shard in finishing.left:
+            self.lose(f"shard {shard} restarted or forgot this session")
+        # Otherwise: a first acquire or view is simply asked again after the new Hello; a lost
+        # grant has already ended this lock through `lose_at`.
+
+    def _on_acquiring(self, shard: str, answer: Answer, now_ns: int) -> None:
+        part = first_asking(self.parts)
+        if part is None or part.shard != shard:
+            return
+        if isinstance(answer, Granted):
+            if answer.epoch != self.client.epoch(shard):
+                return  # a grant of an epoch that is over
+            part.granted(answer, self.client.sendings, ttl_ns=self.client.ttl_ns)
+            self.client.saw_stamp(answer.stamp_ns)
+            epoch = answer.epoch
+            for state in answer.states:
+                self.states.append(Reading(shard, epoch, state))
+            if self.cut is not None:
+                self.cut.not_before(answer.from_ns)
+            self._advance()
+        elif isinstance(answer, Waiting):
+            self.blockers = answer.blockers
+            self._free_calls = 0
+            if now_ns >= self.give_up_ns:
+                self._gives_up()
+        elif isinstance(answer, Stale):
+            self.lose("its place in the queue was lost")
+
+    def _on_viewed(self, shard: str, request: TakeView, answer: Viewed, now_ns: int) -> None:
+        cut = self.cut
+        if self.phase is not Phase.VIEWING or cut is None:
+            return
+        believe = self.client.sendings.believe_until_ns
+        cut.take(shard, request, answer, until_ns=believe(request.count, self.client.ttl_ns))
+        self.client.saw_stamp(answer.stamp_ns)
+        if cut.left:
+            return
+        answers = cut.settled(self.client.epoch, now_ns=now_ns)
+        if answers is not None:
+            for one, viewed in answers.items():
+                self.states += [Reading(one, viewed.epoch, state) for state in viewed.states]
+                self.client.unsettled.shown(one, viewed.states, until_ns=viewed.until_ns)
+            self._advance()
+        elif cut.rounds > ROUNDS_MAX:
+            self.lose("its views over several shards were never of one moment")
+
+    def _advance(self) -> None:
+        """Go on when everything of this phase has arrived."""
+        self._free_calls = FREE_CALLS
+        if self.phase is Phase.ACQUIRING and first_asking(self.parts) is None:
+            self.phase = Phase.VIEWING
+        if self.phase is Phase.VIEWING and (self.cut is None or not self.cut.left):
+            self.phase = Phase.HELD
+
+    # ---------------------------------------------------------------- holding
+
+    def valid(self, now_ns: int) -> bool:
+        """Whether the client may still believe that it holds every lock."""
+        return self.phase is Phase.HELD and all(
+            now_ns < min(part.until_ns, part.hold_until_ns) for part in self.parts
+        )
+
+    @property
+    def sent_commit(self) -> bool:
+        """Whether the commit that decides has been sent: only its shard knows then."""
+        return self._finishing is not None and self._finishing.sent
+
+    @property
+    def no_cut(self) -> bool:
+        """Whether it ended because its views were never of one moment."""
+        return self.phase is Phase.LOST and self.cut is not None and self.cut.rounds > ROUNDS_MAX
+
+    def lose_at(self, shard: str, cause: str) -> None:
+        """A shard has dropped the grant there; what it has prepared it keeps (and says so)."""
+        if self._finishing is None or shard == self._finishing.primary:
+            self.lose(cause)
+
+    def lose(self, cause: str, *, asked_of: Part | None = None) -> None:
+        """A shard has ended this lock; give the rest back.
+
+        Args:
+            cause: The reason, as far as known here.
+            asked_of: The part whose shard knows more (`ask_cause`).
+        """
+        if self.phase is Phase.COMMITTING or not (self.phase.busy or self.phase is Phase.HELD):
+            return
+        self.cause = cause
+        self.taken_from = asked_of
+        self._end(Phase.LOST)
+
+    def ask_cause(self) -> tuple[str, Request] | None:
+        """Return the call that tells why a lock was lost, once; for messages to people."""
+        part, self.taken_from = self.taken_from, None
+        if part is None or part.token is None:
+            return None
+        return part.shard, Validate(self.lock, part.token)
+
+    def told_cause(self, answer: Answer | None) -> None:
+        """Take the answer to `ask_cause`."""
+        if isinstance(answer, Fenced) and answer.lock == self.lock:
+            self.cause = answer.cause
+
+    def _gives_up(self) -> None:
+        """The deadline has passed: rest in what that means in this phase."""
+        if self.phase is Phase.COMMITTING:
+            if self._finishing is not None and self._finishing.pending:
+                primary = self._finishing.primary
+                self.cause = f"shard {primary} still works on it: its disk has not kept it yet"
+            self._end(Phase.UNKNOWN if self.sent_commit else Phase.UNREACHABLE)
+        elif self.phase is Phase.VALIDATING or self.silent_shard:
+            self._end(Phase.UNREACHABLE)
+        else:
+            self._end(Phase.TIMED_OUT)
+
+    def _end(self, phase: Phase) -> None:
+        """Rest in `phase`; whatever may still be held or awaited is given back."""
+        self.phase = phase
+        if self._finishing is not None:
+            self._finishing.writes = {}  # they may be large, and the program may keep the lock
+        if phase not in (Phase.COMMITTED, Phase.UNKNOWN):
+            touched = [part.shard for part in self.parts]
+            touched += [shard for shard, _ in self.plan.views if shard not in touched]
+            self.farewells += [(shard, Release(self.lock)) for shard in touched]
+        self.client.ended(self)
+
+    # ---------------------------------------------------------------- the end
+
+    def release(self) -> None:
+        """Give everything back without writing."""
+        if self.phase.busy or self.phase is Phase.HELD:
+            self._end(Phase.RELEASED)
+
+    def finish(
+        self,
+        writes: Mapping[str, Sequence[WriteItem]],
+        *,
+        give_up_ns: int,
+        expects: Sequence[SlotVersion] = (),
+        reads: Sequence[DatumRead] = (),
+        reads_left_out: int = 0,
+    ) -> None:
+        """Publish `writes` (by shard) if every lock is still held.
+
+        `expects` are versions that were viewed and must still be the newest; `reads` are kept as
+        the lineage of what is written: at most `READS_MAX`, of further ones their number.
+        Ends in COMMITTED, LOST, CHANGED, REFUSED, UNREACHABLE (nothing written) or UNKNOWN.
+        """
+        if self.phase is not Phase.HELD:
+            return
+        self.give_up_ns = give_up_ns
+        self._free_calls = self._retry_at_ns = 0
+        expected = by_shard(expects, self.plan.placement) if expects else {}
+        viewed = {shard: self._epoch_viewed(shard) for shard in expected} if expected else {}
+        tokens = tokens_of(self.parts, viewed)
+        self._finishing = Finishing(
+            self.lock,
+            tokens,
+            {shard: tuple(items) for shard, items in writes.items() if items},
+            expected,
+            tuple(reads),
+            reads_left_out,
+        )
+        self.phase = Phase.VALIDATING
+        self._after_votes()
+
+    def shard_of(self, slot: Slot) -> str:
+        """Return the shard where this lock has a slot, even if the placement changes meanwhile."""
+        return shard_of(slot.entity, self.plan.placement)
+
+    def _epoch_viewed(self, shard: str) -> int:
+        return next((r.epoch for r in self.states if r.shard == shard), self.client.epoch(shard))
+
+    def _after_votes(self) -> None:
+        finishing = self._finishing
+        if finishing is None or finishing.left:
+            return
+        if finishing.primary:
+            self.phase = Phase.COMMITTING
+        else:
+            if not self.parts and any(r.state.large or r.state.same for r in self.states):
+                # The shards keep large data of a lock of views alone.
+                self.farewells += [(shard, Release(self.lock)) for shard, _ in self.plan.views]
+            self._end(Phase.COMMITTED)
+
+    def _on_vote(self, shard: str, answer: Answer) -> None:
+        assert self._finishing is not None
+        if shard not in self._finishing.left:
+            return
+        if isinstance(answer, Valid | Prepared):
+            del self._finishing.left[shard]
+            if isinstance(answer, Prepared):
+                self._finishing.prepared[shard] = answer
+                self.client.saw_stamp(answer.stamp_ns)
+            self._after_votes()
+        elif isinstance(answer, Fenced):
+            self.lose(answer.cause)
+        elif isinstance(answer, Changed):
+            self._changed(answer)
+
+    def _changed(self, answer: Changed) -> None:
+        self.moved = self._finishing.moved(answer) if self._finishing is not None else None
+        how = f"has moved on to version {answer.version} since it was viewed"
+        self.cause = f"{answer.slot} {how if self.moved else 'is about to be written'}"
+        self._end(Phase.CHANGED)
+
+    def _on_committing(self, answer: Answer, now_ns: int) -> None:
+        if isinstance(answer, Committed):
+            self._committed(answer.position, answer.versions)
+        elif isinstance(answer, Fenced):
+            self.cause = answer.cause
+            self._end(Phase.LOST)
+        elif isinstance(answer, Changed):
+            self._changed(answer)
+        elif isinstance(answer, OutcomeIs):
+            self._on_outcome(answer, now_ns)
+
+    def _on_outcome(self, answer: OutcomeIs, now_ns: int) -> None:
+        finishing = self._finishing
+        assert finishing is not None
+        if answer.kind == OUTCOME_COMMITTED:
+            self._committed(answer.position, answer.versions)
+        elif answer.kind == OUTCOME_PENDING:
+            finishing.pending = True
+            self._pause(now_ns)
+        elif answer.kind == OUTCOME_EXPIRED:
+            self.cause = "its shard has no record of this session any more"
+            self._end(Phase.UNKNOWN)
+        elif answer.epoch == finishing.token.epoch:
+            finishing.ask_outcome = False  # it never arrived: send it (again)
+        else:
+            self.cause = f"{SHARD_RESTARTED} before the commit arrived"
+            self._end(Phase.LOST)
+
+    def _committed(self, position: Position, versions: tuple[SlotVersion, ...]) -> None:
+        assert self._finishing is not None
+        self.position, self.versions = position, versions
+        self.client.saw_stamp(position.stamp_ns)
+        if prepared := self._finishing.prepared:
+            self.versions += tuple([v for vote in prepared.values() for v in vote.versions])
+            self.client.committed(prepared, position.stamp_ns)
+        self._end(Phase.COMMITTED)

@@ -1,0 +1,289 @@
+"""The client half of a session: which epoch each shard is in, what is held, what may be believed.
+
+One session per process, one lane per thread.  Rules a change must keep:
+
+  * A new epoch of a shard, or a session that it forgot, ends every lock with a grant there; only
+    then is the epoch acknowledged by `Hello` ("all my older grants here are dropped").
+  * The keep-alive names the lowest seq that each lane still cares for; a grant that the shard lists
+    no longer, though it existed when the keep-alive was sent, is lost.
+  * A seq is used for one lock and never again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
+
+from enact_dist.core.client.lease_clock import Sendings
+from enact_dist.core.client.own_commits import Unsettled
+from enact_dist.core.client.plan import Phase
+from enact_dist.core.protocol.messages import (
+    START,
+    Alive,
+    Answer,
+    EpochChanged,
+    Granted,
+    Hello,
+    KeepAlive,
+    KeepVersions,
+    LaneView,
+    PlacementMap,
+    Welcome,
+)
+from enact_dist.core.state.clock import STAMP_NS_MAX
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from enact_dist.core.client.plan import Part
+    from enact_dist.core.protocol.datum import LockId
+    from enact_dist.core.protocol.messages import Prepared, Request
+
+
+class HeldThere(Protocol):
+    """What a session needs of a lock: which grants it has, and how to end it."""
+
+    lock: LockId
+    phase: Phase
+    parts: list[Part]
+
+    def lose_at(self, shard: str, cause: str) -> None:
+        """Take in that a shard has dropped its grant."""
+
+    def lose(self, cause: str, *, asked_of: Part | None = None) -> None:
+        """Take in that a shard has ended this lock."""
+
+    def ask_again(self) -> None:
+        """Make the next call without a further pause."""
+
+
+L = TypeVar("L", bound=HeldThere)
+
+
+@dataclass(slots=True)
+class Peer:
+    """What this client knows of one shard.
+
+    `acknowledged` is the epoch that a `Hello` has confirmed to the shard; `successions` is how
+    many successions of datum types its newest known catalogue has.
+    """
+
+    epoch: int = 0
+    acknowledged: int = -1
+    successions: int = 0
+
+
+class ClientSession(Generic[L]):
+    """The session of one process over all shards, whose locks `core.client.client` begins."""
+
+    __slots__ = (
+        "_locks",
+        "_peers",
+        "_seqs",
+        "actor",
+        "host",
+        "observer",
+        "pid",
+        "placement",
+        "report",
+        "seen_stamp_ns",
+        "sendings",
+        "session",
+        "ttl_ns",
+        "unsettled",
+    )
+
+    def __init__(
+        self,
+        session: str,
+        *,
+        ttl_ns: int,
+        actor: str = "",
+        host: str = "",
+        pid: int = 0,
+        observer: bool = False,
+    ) -> None:
+        self.session = session
+        self.ttl_ns = ttl_ns
+        self.actor, self.host, self.pid, self.observer = actor, host, pid, observer
+        self.placement = PlacementMap(0, (), ())
+        self.sendings = Sendings()
+        self.seen_stamp_ns = 0
+        self.report = b""
+        self._peers: dict[str, Peer] = {}
+        self._locks: dict[LockId, L] = {}
+        self._seqs: dict[int, int] = {}
+        self.unsettled = Unsettled()
+
+    # ---------------------------------------------------------------- shards
+
+    def _peer(self, shard: str) -> Peer:
+        peer = self._peers.get(shard)
+        if peer is None:
+            peer = self._peers[shard] = Peer()
+        return peer
+
+    def epoch(self, shard: str) -> int:
+        """Return the epoch that the shard was last known in (0: none)."""
+        peer = self._peers.get(shard)
+        return peer.epoch if peer is not None else 0
+
+    def successions(self, shard: str) -> int:
+        """Return how many successions of datum types are known of the shard's catalogue."""
+        peer = self._peers.get(shard)
+        return peer.successions if peer is not None else 0
+
+    def knows_types(self, shard: str, successions: int) -> None:
+        """Note how many successions of datum types the newest known catalogue of a shard has."""
+        self._peer(shard).successions = successions
+
+    def needs_hello(self, shard: str) -> bool:
+        """Whether the shard does not know yet that we are in its epoch."""
+        peer = self._peers.get(shard)
+        return peer is None or peer.epoch == 0 or peer.acknowledged != peer.epoch
+
+    def hello(self, shard: str) -> Hello:
+        """Return the greeting, which acknowledges the epoch that we know."""
+        return Hello(
+            self.session,
+            self.epoch(shard),
+            self.ttl_ns,
+            self.actor,
+            self.host,
+            self.pid,
+            self.observer,
+        )
+
+    def answered(self, shard: str, request: Request, answer: Answer, now_ns: int) -> bool:
+        """Take what concerns the session; return whether that was all of the answer."""
+        if isinstance(answer, Welcome) and isinstance(request, Hello):
+            self._welcomed(shard, request, answer)
+            return True
+        if isinstance(answer, EpochChanged):
+            self._epoch_changed(shard, answer.epoch, asked_in=_epoch_of(request))
+            return False
+        if isinstance(answer, Alive) and isinstance(request, KeepAlive):
+            self._alive(shard, request, answer, now_ns)
+            return True
+        if self.unsettled and isinstance(answer, Granted):
+            self.unsettled.shown(shard, answer.states)
+        return False
+
+    def _welcomed(self, shard: str, request: Hello, answer: Welcome) -> None:
+        peer = self._peer(shard)
+        if answer.epoch < peer.epoch:
+            return  # an old answer
+        if answer.epoch != peer.epoch:
+            self._drop_grants(shard)
+            first = peer.epoch == 0
+            peer.epoch = answer.epoch
+            # The first Hello of a session leaves nothing older to be acknowledged, unless the shard
+            # restarted before its first answer came through and now waits for us.
+            peer.acknowledged = answer.epoch if first and answer.open else -1
+        elif request.known_epoch == answer.epoch:
+            peer.acknowledged = answer.epoch
+        self.ttl_ns = min(self.ttl_ns, answer.ttl_ns)
+        self.learn_placement(answer.placement)
+
+    def _epoch_changed(self, shard: str, epoch: int, *, asked_in: int | None) -> None:
+        peer = self._peer(shard)
+        late = asked_in is not None and asked_in < epoch == peer.epoch
+        if epoch < peer.epoch or late:
+            return  # whatever was held before is dropped already
+        self._drop_grants(shard)
+        peer.epoch = epoch
+        peer.acknowledged = -1
+
+    def _drop_grants(self, shard: str) -> None:
+        for lock in list(self._locks.values()):
+            if any(part.shard == shard and part.token is not None for part in lock.parts):
+                lock.lose_at(shard, f"shard {shard} restarted or forgot this session")
+
+    def learn_placement(self, placement: PlacementMap) -> None:
+        """Take over the shard's placement map; where shards differ, the newest answer counts."""
+        self.placement = placement
+
+    def saw_stamp(self, stamp_ns: int) -> None:
+        """Remember the largest stamp seen: later commits come after it everywhere.
+
+        A timestamp that no clock gives is ignored: every shard would refuse any later one.
+        """
+        if stamp_ns <= STAMP_NS_MAX:
+            self.seen_stamp_ns = max(self.seen_stamp_ns, stamp_ns)
+
+    def committed(self, votes: Mapping[str, Prepared], stamp_ns: int) -> None:
+        """Note on which slots the shards that have voted may not show a commit of ours yet."""
+        for shard, vote in votes.items():
+            slots = (version.slot for version in vote.versions)
+            self.unsettled.committed(shard, slots, stamp_ns)
+
+    def unsettled_ns(self, shard: str) -> int:
+        """Return the stamp of a commit of ours that a shard may not show yet (0: none)."""
+        return self.unsettled.stamp_ns(shard)
+
+    def reached(self, shard: str, stamp_ns: int) -> None:
+        """Note that a shard shows everything up to a stamp."""
+        self.unsettled.reached(shard, stamp_ns)
+
+    # ---------------------------------------------------------------- keep-alive
+
+    def keep_alive(self, shard: str, now_ns: int) -> Request:
+        """Return the next sign of life for a shard."""
+        if self.needs_hello(shard):
+            return self.hello(shard)
+        live: dict[int, int] = {lane: seq + 1 for lane, seq in self._seqs.items()}
+        for lock in self._locks:
+            live[lock.lane] = min(lock.seq, live[lock.lane])
+        view = tuple([LaneView(lane, seq) for lane, seq in live.items()])
+        count = self.sendings.next(now_ns)
+        return KeepAlive(self.session, self.epoch(shard), count, view, self.report)
+
+    def _alive(self, shard: str, request: KeepAlive, answer: Alive, now_ns: int) -> None:
+        if answer.epoch != self.epoch(shard):
+            return
+        self.saw_stamp(answer.stamp_ns)
+        left = {grant.lock: grant for grant in answer.grants}
+        believe = self.sendings.believe_until_ns
+        for lock in list(self._locks.values()):
+            for part in lock.parts:
+                if part.shard != shard or part.token is None:
+                    continue
+                grant = left.get(lock.lock)
+                if grant is not None and grant.token == part.token:
+                    part.until_ns = max(part.until_ns, believe(answer.count_seen, self.ttl_ns))
+                    part.hold_until_ns = max(
+                        part.hold_until_ns, believe(answer.count_seen, grant.hold_left_ns)
+                    )
+                elif part.granted_count < request.count and lock.phase in _GRANTS_COUNT:
+                    cause = f"shard {shard} holds it for this session no more"
+                    lock.lose(cause, asked_of=part)
+
+    # ---------------------------------------------------------------- locks
+
+    def ended(self, lock: L) -> None:
+        """Forget a lock that rests; called by the lock itself."""
+        self._locks.pop(lock.lock, None)
+
+    def ask_again(self) -> None:
+        """A shard has come back: no lock need wait any longer before it asks again."""
+        for lock in self._locks.values():
+            lock.ask_again()
+
+    def shards_in_use(self) -> list[str]:
+        """Return the shards that know this session, to keep it alive there.
+
+        Also while another thread learns of one.
+        """
+        return [shard for shard, peer in tuple(self._peers.items()) if peer.epoch]
+
+
+_GRANTS_COUNT = frozenset((Phase.ACQUIRING, Phase.VIEWING, Phase.HELD))
+
+
+def _epoch_of(request: Request) -> int | None:
+    """Return the epoch that a request was made for (that of its grant, token or cursor)."""
+    made_in = getattr(request, "token", None) or getattr(request, "after", None)
+    if made_in is None or (made_in == START and isinstance(request, KeepVersions)):
+        return getattr(request, "epoch", None)
+    epoch: int = made_in.epoch
+    return epoch

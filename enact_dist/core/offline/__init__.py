@@ -1,0 +1,1 @@
+"""Work on the records of a shard that does not run: move, purge, recount."""

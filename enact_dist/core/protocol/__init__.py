@@ -1,0 +1,1 @@
+"""The protocol: messages, answers, records and data, and checks that need no state."""

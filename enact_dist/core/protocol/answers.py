@@ -1,0 +1,399 @@
+"""What a shard answers; see `core.protocol.messages` for the rules."""
+
+from __future__ import annotations
+
+from enact_dist.core.protocol.datum import Datum, LockId, Position, Slot, Token
+from enact_dist.core.protocol.message import message
+from enact_dist.core.protocol.parts import (
+    START,
+    AspectEntry,
+    AuditEntry,
+    Counter,
+    Cursor,
+    GrantLeft,
+    Holder,
+    PlacementMap,
+    SessionInfo,
+    ShardEntry,
+    SlotState,
+    SlotVersion,
+    VersionEntry,
+    WorldEntry,
+)
+
+
+@message
+class Welcome:
+    """Who this shard is and what the cell looks like from here."""
+
+    shard: str
+    epoch: int
+    open: bool
+    ttl_ns: int
+    wall_ns: int
+    notice_number: int
+    placement: PlacementMap
+    worlds: tuple[str, ...]
+    aspects: tuple[AspectEntry, ...]
+    shared: str = ""
+    shared_nonce: bytes = b""
+    forks: tuple[WorldEntry, ...] = ()
+
+
+@message
+class Registered:
+    """The catalogue after registration."""
+
+    worlds: tuple[str, ...]
+    aspects: tuple[AspectEntry, ...]
+    forks: tuple[WorldEntry, ...] = ()
+
+
+@message
+class Granted:
+    """The lock is held.  `states`: every named slot, and every matching one of a pattern.
+
+    `count_seen` is the highest message counter that had arrived from the session; `hold_left_ns`
+    counts from when this was sent.  `stamp_ns` is the shard's hybrid logical time, `from_ns` the
+    largest stamp of what is shown: views elsewhere must not lie before it.
+    """
+
+    lock: LockId
+    token: Token
+    epoch: int
+    count_seen: int
+    hold_left_ns: int
+    stamp_ns: int
+    states: tuple[SlotState, ...]
+    from_ns: int = 0
+
+
+@message
+class Waiting:
+    """Not yet granted; ask again.  `place` counts from 1, `blockers` are those in the way."""
+
+    lock: LockId
+    epoch: int
+    place: int
+    blockers: tuple[Holder, ...]
+
+
+@message
+class Stale:
+    """This seq was granted before, or a newer one of its lane is known: take a new seq."""
+
+    lock: LockId
+    epoch: int
+
+
+@message
+class Viewed:
+    """Committed data that were current from `from_ns` to `until_ns`, at every stamp between.
+
+    Where the first lies after the second, an undecided commit stands in the way: ask again at
+    `from_ns`.
+    """
+
+    lock: LockId
+    epoch: int
+    stamp_ns: int
+    states: tuple[SlotState, ...]
+    from_ns: int = 0
+    until_ns: int = 0
+
+
+@message
+class Slice:
+    """A part of a datum's body."""
+
+    slot: Slot
+    version: int
+    encoding: bytes
+    stamp_ns: int
+    total: int
+    offset: int
+    body: Datum
+    """Body bytes of this part, carried as the body of a datum without encoding."""
+
+
+@message
+class Gone:
+    """The asked version is neither current nor pinned by this lock."""
+
+    slot: Slot
+    version: int
+
+
+@message
+class Alive:
+    """The session is renewed; these are its live grants."""
+
+    epoch: int
+    count_seen: int
+    notice_number: int
+    stamp_ns: int
+    grants: tuple[GrantLeft, ...]
+
+
+@message
+class Committed:
+    """All writes of the lock are visible."""
+
+    lock: LockId
+    position: Position
+    versions: tuple[SlotVersion, ...]
+
+
+@message
+class Staged:
+    """So much of a payload has come in slices, from its begin on, without a hole.
+
+    `shared` says that it is a file in the shard's folder, to be filled there, too.  Until its
+    commit it is called `draft` there ("": `file`), a name that only this client learns.
+    """
+
+    file: str
+    have: int
+    shared: bool
+    draft: str = ""
+
+
+@message
+class Fenced:
+    """The lock is no longer held (or never was in this epoch); nothing was written."""
+
+    lock: LockId
+    cause: str
+
+
+@message
+class Changed:
+    """An expected slot has moved on to this version; nothing was written, the lock is released.
+
+    The expected version itself means: another lock holds the slot for writing now.
+    """
+
+    lock: LockId
+    slot: Slot
+    version: int
+
+
+@message
+class Prepared:
+    """The writes are kept until the primary decides; their stamp is at least this one.
+
+    They outlast a power cut even where their data are `os` or volatile: so do the reads beside
+    them, on which the decision relies.
+    """
+
+    lock: LockId
+    stamp_ns: int
+    versions: tuple[SlotVersion, ...]
+
+
+@message
+class Finished:
+    """Nothing of the lock waits for a decision here any more, and that survives."""
+
+    lock: LockId
+
+
+@message
+class Resolved:
+    """What the primary has decided: `kind` is one of `RESOLVED_*`."""
+
+    lock: LockId
+    kind: str
+    position: Position
+
+
+RESOLVED_COMMITTED = "committed"
+RESOLVED_ABORTED = "aborted"
+RESOLVED_OPEN = "open"
+
+
+@message
+class OutcomeIs:
+    """What became of a commit: `kind` is one of `OUTCOME_*`."""
+
+    lock: LockId
+    epoch: int
+    kind: str
+    position: Position
+    versions: tuple[SlotVersion, ...]
+
+
+OUTCOME_COMMITTED = "committed"
+OUTCOME_PENDING = "pending"
+OUTCOME_UNSEEN = "unseen"
+OUTCOME_EXPIRED = "expired"
+
+
+@message
+class Valid:
+    """The lock was held without interruption until now; it is released."""
+
+    lock: LockId
+
+
+@message
+class Released:
+    """Nothing of the lock or session is left here."""
+
+
+@message
+class Reached:
+    """Whether all commits up to the asked stamp are visible."""
+
+    reached: bool
+    stamp_ns: int
+
+
+@message
+class Pong:
+    """This shard runs: since when, and whether it grants locks (`core.state.clock`).
+
+    It stays this small whatever the shard holds.  Every start of a daemon has another `start`,
+    which tells two daemons with the same name apart.
+    """
+
+    shard: str
+    epoch: int
+    open: bool
+    state: str
+    uptime_ns: int
+    start: int = 0
+
+
+@message
+class Places:
+    """Where the answering shard expects each shard of the cell, itself included."""
+
+    shards: tuple[ShardEntry, ...]
+
+
+@message
+class Surveyed:
+    """Slots without data, and the notice number up to which they are current."""
+
+    epoch: int
+    notice_number: int
+    stamp_ns: int
+    states: tuple[SlotState, ...]
+    more: Cursor = START
+
+
+@message
+class Locks:
+    """Holders and waiters, oldest first."""
+
+    epoch: int
+    holders: tuple[Holder, ...]
+    more: Cursor = START
+
+
+@message
+class Sessions:
+    """Sessions, catalogue and counters of a shard; the catalogue stands on the first page alone."""
+
+    shard: str
+    epoch: int
+    open: bool
+    uptime_ns: int
+    wall_ns: int
+    slots: int
+    bytes: int
+    sessions: tuple[SessionInfo, ...]
+    worlds: tuple[str, ...]
+    aspects: tuple[AspectEntry, ...]
+    counters: tuple[Counter, ...]
+    more: Cursor = START
+
+
+@message
+class Broken:
+    """Whether a lock of that number was live, and what it was."""
+
+    found: bool
+    holder: Holder | None
+
+
+@message
+class Audited:
+    """The newest acts of operators, oldest first, and the number of unacknowledged alarms."""
+
+    alarms: int
+    entries: tuple[AuditEntry, ...]
+    more: Cursor = START
+
+
+@message
+class EpochChanged:
+    """The shard is in this epoch and does not know the session there: drop, say Hello, go on."""
+
+    epoch: int
+
+
+@message
+class WrongShard:
+    """The request was placed by another map than the shard's."""
+
+    placement: PlacementMap
+
+
+@message
+class Refused:
+    """The request cannot be executed; `code` names the error class to raise."""
+
+    code: str
+    text: str
+
+
+@message
+class Versions:
+    """Versions of slots: slot by slot, oldest first."""
+
+    epoch: int
+    stamp_ns: int
+    entries: tuple[VersionEntry, ...]
+    more: Cursor = START
+
+
+@message
+class Forgotten:
+    """The state of a slot as of the asked stamp has left its retention.
+
+    All that was asked here is known from `oldest_ns` on.
+    """
+
+    slot: Slot
+    oldest_ns: int
+
+
+@message
+class Forked:
+    """The fork is there, with so many slots."""
+
+    world: str
+    slots: int
+    stamp_ns: int
+
+
+@message
+class Dropped:
+    """The world context is not there (any more); so many slots of it went now."""
+
+    world: str
+    slots: int
+
+
+@message
+class Kept:
+    """What a label keeps now, and which of the asked versions were forgotten before.
+
+    Of what it keeps one page, by slot and version.
+    """
+
+    versions: tuple[SlotVersion, ...]
+    forgotten: tuple[SlotVersion, ...]
+    more: Cursor = START

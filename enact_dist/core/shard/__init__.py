@@ -1,0 +1,1 @@
+"""A shard: requests in, answers and records out, with time as an argument."""

@@ -1,0 +1,253 @@
+"""Locks at the shard's door: acquire, fetch, release."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.core.protocol.checks import unknown_world, wrong_access
+from enact_dist.core.protocol.datum import Column, Datum, LockId
+from enact_dist.core.protocol.messages import (
+    Acquire,
+    Answer,
+    EpochChanged,
+    Fetch,
+    Gone,
+    Refused,
+    Release,
+    Released,
+    Slice,
+    Stale,
+    WrongShard,
+)
+from enact_dist.core.protocol.records import Effect, Reply
+from enact_dist.core.shard import quotas
+from enact_dist.core.state.grants import SHAPE_ITEMS_MAX, SHAPES_MAX
+from enact_dist.core.state.sessions import LANES_MAX, Session
+from enact_dist.terms import ACCESSES
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from enact_dist.core.protocol.messages import Item
+    from enact_dist.core.shard.on_prepare import PrepareDesk
+    from enact_dist.core.shard.state import ShardState
+
+ITEMS_MAX: Final = 4096
+"""Requests in one lock or view."""
+LOCKS_MAX: Final = 100_000
+"""Locks, granted or waiting, at one shard."""
+LOOKED_MAX: Final = 1_000_000
+"""Slots that the patterns of one lock or view may have to look at, if there are several."""
+NEWER_TYPE: Final = "newer_type"
+"""The code of a refusal until the client has looked at the types of the shard's aspects again."""
+DAMAGED: Final = "damaged"
+"""The code of a refusal because the stored bytes of a datum are not what was stored."""
+
+
+class LockDesk:
+    """Everything about who gets which lock, and the data that come with it."""
+
+    def __init__(self, state: ShardState, prepares: PrepareDesk) -> None:
+        self._state = state
+        self._prepares = prepares
+        self._right: set[tuple[Item, ...]] = set()
+
+    def on_acquire(self, message: Acquire, reply_to: int) -> Iterable[Effect]:
+        """Queue a lock, or continue with one that is already queued or granted."""
+        state, lock = self._state, message.lock
+        session = state.session_in_epoch(lock.session, message.epoch)
+        refusal = self.refused(session, message.map_version, message.items)
+        if refusal is not None or session is None:
+            return [Reply(reply_to, refusal or EpochChanged(state.epoch))]
+        if session.observer:
+            text = "this session only observes and cannot lock; connect without observer=True"
+            return [Reply(reply_to, Refused("value", text))]
+        session.renewed_ns = max(session.renewed_ns, state.now_ns)
+        session.count_seen = max(session.count_seen, message.count)
+        tenures, effects = state.tenures, list[Effect]()
+        tenure = tenures.by_lock.get(lock)
+        if tenure is None:
+            refused = self._kept_out(message, session, reply_to)
+            if refused is not None:
+                return refused
+            if lock.session in tenures.by_session or state.pins.by_session:
+                effects += self._supersede(lock)
+            session.lane(lock.lane).top = lock.seq
+            tenure = tenures.enqueue(message, now_ns=state.now_ns, at_once=state.grants)
+            if tenures.table.ready:
+                effects += state.grant_ready()
+        if tenure.token is not None:
+            stamp_ns = state.stamp(message.seen_stamp_ns)
+            granted = tenures.granted(tenure, now_ns=state.now_ns, stamp_ns=stamp_ns)
+            effects.append(Reply(reply_to, granted))
+        else:
+            state.count("lock_waits")
+            effects += tenures.park(
+                tenure, reply_to=reply_to, wait_ns=message.wait_ns, now_ns=state.now_ns
+            )
+        return effects
+
+    def _kept_out(
+        self, message: Acquire, session: Session, reply_to: int
+    ) -> Iterable[Effect] | None:
+        """Return why a new lock gets no place in the queue, None if it gets one."""
+        state, lock = self._state, message.lock
+        if message.successions != state.catalogue.successions:  # not the usual case
+            missed = self._missed_type(message)
+            if missed is not None:
+                state.count("newer_types_missed")
+                return [Reply(reply_to, missed)]
+        lane = session.lanes.get(lock.lane)
+        if lane is None:
+            if len(session.lanes) >= LANES_MAX:
+                return [Reply(reply_to, Refused("overload", f"{LANES_MAX} lanes in one session"))]
+        elif lock.seq <= lane.top:
+            state.count("stale")
+            return [Reply(reply_to, Stale(lock, state.epoch))]
+        tenures = state.tenures
+        if len(tenures.by_lock) >= quotas.WAITERS_MAX and self._has_its_share(session):
+            bound = f"{quotas.WAITERS_MAX} locks held or awaited"
+            return state.quotas.refuse(reply_to, session.identity, bound)
+        if session.identity and (
+            tenures.items_waiting(session.identity) >= quotas.ITEMS_WAITING_MAX
+        ):
+            bound = f"{quotas.ITEMS_WAITING_MAX} requests in locks that wait"
+            return state.quotas.refuse(reply_to, session.identity, bound)
+        return None
+
+    def _missed_type(self, message: Acquire) -> Refused | None:
+        """Refuse to let a client write an aspect whose type it has perhaps not compared yet."""
+        catalogue = self._state.catalogue
+        for item in message.items:
+            if ACCESSES[item.access].writes:
+                entry = catalogue.newer_type(item.aspect, message.successions)
+                if entry is not None:
+                    text = f"aspect {item.aspect!r} has the datum type {entry.fingerprint} now"
+                    return Refused(NEWER_TYPE, text)
+        return None
+
+    def _has_its_share(self, session: Session) -> bool:
+        """Whether the identity of a session has as many locks as one may have."""
+        if not session.identity:
+            return False
+        tenures = self._state.tenures
+        mine = self._state.sessions.of(session.identity)
+        return sum(len(tenures.by_session.get(one, ())) for one in mine) >= quotas.WAITERS_MAX
+
+    def _supersede(self, lock: LockId) -> Iterator[Effect]:
+        """A newer lock of a lane ends the older ones: their release was lost."""
+        for tenure in self._state.tenures.of_session(lock.session):
+            older = tenure.lock.lane == lock.lane and tenure.lock.seq < lock.seq
+            if older and not tenure.bound:
+                self._state.count("superseded")
+                yield from self._state.tenures.take_away(
+                    tenure, "a newer lock of its thread", now_ns=self._state.now_ns
+                )
+        self._state.pins.drop_older(lock.session, {lock.lane: lock.seq})
+
+    def refused(
+        self, session: Session | None, map_version: int, items: tuple[Item, ...]
+    ) -> Answer | None:
+        """Return why this shard cannot grant these items, None if it can."""
+        if session is None:
+            return EpochChanged(self._state.epoch)
+        if map_version != self._state.settings.placement.version:
+            self._state.count("wrong_shard")
+            return WrongShard(self._state.settings.placement)
+        if len(items) > ITEMS_MAX:
+            return Refused("value", f"{len(items)} requests in one lock; at most {ITEMS_MAX}")
+        if len(self._state.tenures.by_lock) >= LOCKS_MAX:
+            return Refused("overload", f"{LOCKS_MAX} locks are held or awaited here")
+        if items not in self._right:
+            wrong = wrong_access(items) or self._too_much_to_look_at(items)
+            if wrong is not None:
+                return wrong
+            self._note_right(items)
+        worlds, aspects = self._state.catalogue.worlds, self._state.catalogue.aspects
+        for item in items:
+            if item.context not in worlds:
+                return unknown_world(item.context, worlds)
+            if item.aspect not in aspects and ACCESSES[item.access].writes:
+                # Reading an unregistered aspect is no fault: its slots are null.
+                return Refused("unknown_aspect", f"aspect {item.aspect!r} is not registered here")
+        return None
+
+    def _note_right(self, items: tuple[Item, ...]) -> None:
+        """Remember a set of requests with nothing wrong in it, whatever slots there are."""
+        patterns = sum(ACCESSES[item.access].each for item in items)
+        if patterns <= 1 and len(items) <= SHAPE_ITEMS_MAX:
+            if len(self._right) >= SHAPES_MAX:
+                self._right.clear()
+            self._right.add(items)
+
+    def _too_much_to_look_at(self, items: tuple[Item, ...]) -> Refused | None:
+        """Refuse many patterns over many slots: everybody else waits while they are matched."""
+        column = self._state.slots.of_column
+        columns = [Column(i.context, i.aspect) for i in items if ACCESSES[i.access].each]
+        looked = sum([len(column(one)) for one in columns]) if len(columns) > 1 else 0
+        if looked <= LOOKED_MAX:
+            return None
+        return Refused(
+            "value",
+            f"{len(columns)} patterns in one lock would look at {looked} slots; at most"
+            f" {LOOKED_MAX}; ask for the entities by name, or with fewer patterns",
+        )
+
+    def on_fetch(self, message: Fetch, reply_to: int) -> Iterator[Effect]:
+        """Hand out a part of a large datum that a lock pins, or that is current."""
+        if self._state.session_in_epoch(message.lock.session, message.epoch) is None:
+            yield Reply(reply_to, EpochChanged(self._state.epoch))
+            return
+        datum = self._pinned(message)
+        if datum is None:
+            self._state.count("fetches_gone")
+            yield Reply(reply_to, Gone(message.slot, message.version))
+            return
+        fault = datum.fault() if datum.fault is not None else ""
+        if fault:
+            self._state.count("fetches_damaged")
+            yield Reply(reply_to, _damaged(message, fault))
+            return
+        length = min(message.length, self._state.settings.fetch_bytes_max)
+        body = memoryview(datum.body)[message.offset : message.offset + length]
+        part = Datum(b"", body, len(body))
+        self._state.count("bytes_fetched", len(body))
+        yield Reply(
+            reply_to,
+            Slice(
+                message.slot,
+                message.version,
+                datum.encoding,
+                datum.stamp_ns,
+                datum.size,
+                message.offset,
+                part,
+            ),
+        )
+
+    def _pinned(self, message: Fetch) -> Datum | None:
+        tenure = self._state.tenures.by_lock.get(message.lock)
+        key = (message.slot, message.version)
+        for pins in (tenure.pins if tenure else {}, self._state.pins.get(message.lock)):
+            if key in pins:
+                return pins[key]
+        content = self._state.slots[message.slot]
+        return content.datum if content.version == message.version else None
+
+    def on_release(self, message: Release, reply_to: int) -> Iterator[Effect]:
+        """Give up a lock, its place and its pins; always answered."""
+        tenure = self._state.tenures.by_lock.get(message.lock)
+        if tenure is not None and not tenure.bound:
+            yield from self._state.tenures.remove(tenure, now_ns=self._state.now_ns)
+        elif tenure is not None:
+            self._prepares.hint(message.lock)
+        self._state.pins.drop(message.lock)
+        yield Reply(reply_to, Released())
+
+
+def _damaged(message: Fetch, fault: str) -> Refused:
+    return Refused(
+        DAMAGED,
+        f"version {message.version} of {message.slot} was asked and cannot be read: {fault};"
+        " restore the folder of its shard from a backup, or do without this version",
+    )

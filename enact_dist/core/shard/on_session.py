@@ -1,0 +1,284 @@
+"""Sessions at the shard's door: hello, catalogue, keep-alive, goodbye, expiry."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.core.protocol.checks import wrong_aspect, wrong_name
+from enact_dist.core.protocol.messages import (
+    Alive,
+    Answer,
+    EpochChanged,
+    Goodbye,
+    GrantLeft,
+    Hello,
+    KeepAlive,
+    Refused,
+    Register,
+    Registered,
+    Released,
+    Welcome,
+    WorldEntry,
+)
+from enact_dist.core.protocol.records import (
+    AspectRecord,
+    Effect,
+    Persist,
+    Record,
+    Reply,
+    SessionDied,
+    SessionEnded,
+    SessionRecord,
+    SessionSeen,
+    Story,
+    WorldRecord,
+)
+from enact_dist.core.shard import quotas
+from enact_dist.core.shard.inspection import REPORT_BYTES_MAX
+from enact_dist.terms import Durability
+
+if TYPE_CHECKING:
+    from collections.abc import Generator, Iterator
+
+    from enact_dist.core.shard.state import ShardState
+
+TTL_NS_MIN: Final = 100_000_000
+"""Leases shorter than this would be lost to ordinary scheduling delays."""
+
+
+class SessionDesk:
+    """Everything about who is alive.  Negative tickets of the store are this desk's own."""
+
+    def __init__(self, state: ShardState) -> None:
+        self._state = state
+        self._answers_after: dict[int, list[tuple[int, Answer]]] = {}
+        self._recording: dict[str, int] = {}
+        self._recorded: dict[int, str] = {}
+        self._ticket = 0
+
+    @property
+    def waits_for_store(self) -> bool:
+        """Whether an answer waits for its record to be durable."""
+        return bool(self._answers_after)
+
+    def on_hello(self, message: Hello, reply_to: int) -> Iterator[Effect]:
+        """Open a session, or take its acknowledgement of this epoch."""
+        known = self._state.sessions.by_id.get(message.session)
+        if known is None:
+            sessions, asker = self._state.sessions, self._state.asker
+            if asker and len(sessions.of(asker)) >= quotas.SESSIONS_MAX:
+                bound = f"{quotas.SESSIONS_MAX} sessions"
+                yield from self._state.quotas.refuse(reply_to, asker, bound)
+                return
+            if sessions.full(self._state.now_ns) and not (yield from self._make_room()):
+                yield Reply(
+                    reply_to, Refused("overload", f"{len(sessions.by_id)} sessions are open")
+                )
+                return
+        ttl_ns = max(TTL_NS_MIN, min(message.ttl_ns, self._state.settings.ttl_ns_max))
+        session, unrecorded = self._state.sessions.hello(
+            message,
+            identity=self._state.asker,
+            epoch=self._state.epoch,
+            ttl_ns=ttl_ns,
+            now_ns=self._state.now_ns,
+        )
+        self._state.sessions.end_grace_if_all_acknowledged(self._state.now_ns)
+        shown = self._state.catalogue.shown()
+        welcome = Welcome(
+            self._state.settings.name,
+            self._state.epoch,
+            not self._state.sessions.in_grace(self._state.now_ns),
+            session.ttl_ns,
+            self._state.wall_ns,
+            self._state.commits.notice_number,
+            self._state.settings.placement,
+            shown.worlds,
+            shown.aspects,
+            self._state.settings.shared,
+            self._state.settings.shared_nonce,
+            shown.forks,
+        )
+        if unrecorded and session.session not in self._recording:
+            # A session that a restart would not know could lose its grants without the grace, so
+            # it may do nothing before its record is durable.
+            record = SessionRecord(session.session, session.ttl_ns, session.identity)
+            yield from self.answer_when_durable(reply_to, welcome, (record,))
+            self._recording[session.session] = self._ticket
+            self._recorded[self._ticket] = session.session
+        else:
+            session.present = session.present or not unrecorded
+            yield from self.answer_when_durable(reply_to, welcome, ())
+
+    def _make_room(self) -> Generator[Effect, None, bool]:
+        """End the oldest session without a request since its hello; False if there is none."""
+        for session in self._state.sessions.unproven(self._state.now_ns):
+            if session.session not in self._state.tenures.by_session:
+                self._state.count("sessions_displaced")
+                yield from self.end(session.session, "it made room for another session")
+                return True
+        return False
+
+    def answer_when_durable(
+        self,
+        reply_to: int,
+        answer: Answer,
+        records: tuple[Record, ...],
+        durability: Durability = Durability.DURABLE,
+    ) -> Iterator[Effect]:
+        """Answer when `records` are kept, and all before them that the answer may tell of."""
+        if records:
+            self._ticket -= 1
+            self._answers_after[self._ticket] = [(reply_to, answer)]
+            yield Persist(self._ticket, records, durability)
+        elif self._answers_after:
+            next(reversed(self._answers_after.values())).append((reply_to, answer))
+        else:
+            yield Reply(reply_to, answer)
+
+    def persisted(self, ticket: int) -> Iterator[Effect]:
+        """The records of one of this desk's answers are kept: answer."""
+        session = self._recorded.pop(ticket, "")
+        if self._recording.get(session) == ticket:
+            del self._recording[session]
+            found = self._state.sessions.by_id.get(session)
+            if found is not None:
+                found.durable = found.present = True
+        for reply_to, answer in self._answers_after.pop(ticket):
+            yield Reply(reply_to, answer)
+
+    def on_register(self, message: Register, reply_to: int) -> Iterator[Effect]:
+        """Create world contexts and register aspects, all or none."""
+        catalogue = self._state.catalogue
+        if self._state.sessions.known(message.session) is None:
+            yield Reply(reply_to, EpochChanged(self._state.epoch))
+            return
+        before = catalogue.entries(entry.name for entry in message.aspects)
+        size = catalogue.bytes
+        missing = [name for name in message.worlds if name not in catalogue.worlds]
+        for name in missing:
+            wrong = wrong_name("world context", name, slashes=False) or self._state.busy_world(name)
+            if wrong is not None:
+                yield Reply(reply_to, wrong)
+                return
+        records: list[Record] = [WorldRecord(name) for name in missing]
+        for entry in message.aspects:
+            wrong = wrong_aspect(entry)
+            registered = catalogue.register(entry) if wrong is None else wrong
+            if isinstance(registered, str):
+                registered = Refused("datum_type", registered)
+            if isinstance(registered, Refused):
+                catalogue.put_back(before)
+                yield Reply(reply_to, registered)
+                return
+            if registered[1]:
+                records.append(AspectRecord(registered[0]))
+        for name in missing:
+            catalogue.add_world(WorldEntry(name))
+        refusal = catalogue.refusal(len(missing), before, size)
+        if refusal is not None:
+            for name in missing:
+                catalogue.drop_world(name)
+            catalogue.put_back(before)
+            self._state.count("overloads")
+            yield Reply(reply_to, refusal)
+            return
+        succeeded = [
+            record.entry
+            for record in records
+            if isinstance(record, AspectRecord)
+            and (known := before[record.entry.name]) is not None
+            and record.entry.older != known.older
+        ]
+        for entry in succeeded:
+            self._state.count("types_succeeded")
+            told = f"aspect {entry.name!r} has the datum type {entry.fingerprint} from now on"
+            yield Story("aspect.type", f"{told}, which succeeds {entry.older[-1]}")
+        answer = Registered(*catalogue.shown()[:3])
+        yield from self.answer_when_durable(reply_to, answer, tuple(records))
+
+    def on_keep_alive(self, message: KeepAlive, reply_to: int) -> Iterator[Effect]:
+        """Renew a session and free what it does not want any more."""
+        session = self._state.session_in_epoch(message.session, message.epoch)
+        if session is None:
+            yield Reply(reply_to, EpochChanged(self._state.epoch))
+            return
+        session.renewed_ns = max(session.renewed_ns, self._state.now_ns)
+        session.count_seen = max(session.count_seen, message.count)
+        if message.report:  # kept for listings, which leave longer ones out
+            session.report = message.report if len(message.report) <= REPORT_BYTES_MAX else b""
+        lowest = {view.lane: view.seq for view in message.view}
+        for tenure in self._state.tenures.of_session(message.session):
+            if tenure.lock.seq < lowest.get(tenure.lock.lane, 0) and not tenure.bound:
+                self._state.count("orphans_freed")
+                told = self._state.tenures.told(tenure, self._state.now_ns)
+                yield Story("lock.orphan", f"{told}, freed: its client no longer wants it")
+                yield from self._state.tenures.remove(tenure, now_ns=self._state.now_ns)
+        self._state.pins.drop_older(message.session, lowest)
+        grants = tuple(
+            [
+                GrantLeft(
+                    tenure.lock, tenure.token, max(0, tenure.hold_end_ns - self._state.now_ns)
+                )
+                for tenure in self._state.tenures.of_session(message.session)
+                if tenure.token is not None
+            ]
+        )
+        yield Reply(
+            reply_to,
+            Alive(
+                self._state.epoch,
+                session.count_seen,
+                self._state.commits.notice_number,
+                self._state.stamp(),
+                grants,
+            ),
+        )
+
+    def on_goodbye(self, message: Goodbye, reply_to: int) -> Iterator[Effect]:
+        """End a session at its own wish."""
+        yield from self.end(message.session, "its session said goodbye")
+        yield Reply(reply_to, Released())
+
+    def on_session_died(self, message: SessionDied, _: int) -> Iterator[Effect]:
+        """End a session whose process is proven to be gone, so no client believes in its locks."""
+        found = self._state.sessions.by_id.get(message.session)
+        if found is not None:
+            self._state.count("sessions_died")
+            who = f"{found.actor or 'client'}@{found.host} pid {found.pid}"
+            yield Story("session.died", f"the process of {who} ended, session {found.session}")
+            yield from self.end(message.session, "its process died")
+
+    def end(self, session: str, cause: str) -> Iterator[Effect]:
+        """End a session: free its locks, forget its pins, keep its outcomes."""
+        found = self._state.sessions.by_id.get(session)
+        if found is None:
+            return
+        tenures = self._state.tenures.of_session(session)
+        for tenure in tenures:
+            if not tenure.bound:
+                yield from self._state.tenures.take_away(tenure, cause, now_ns=self._state.now_ns)
+        self._state.pins.drop_session(session)
+        self._state.sessions.forget(session)
+        self._state.tenures.session_ended(session)
+        self._state.sessions.end_grace_if_all_acknowledged(self._state.now_ns)
+        recording = self._recording.pop(session, None)
+        if found.durable or recording is not None:
+            yield Persist(0, (SessionEnded(session, self._state.wall_ns),), Durability.OS)
+
+    def on_session_seen(self, message: SessionSeen, _: int) -> Iterator[Effect]:
+        """Note that a liveliness token appeared or vanished."""
+        mine = self._state.sessions.token_seen(
+            message.session,
+            message.present,
+            identity=message.identity,
+            now_ns=self._state.now_ns,
+        )
+        if mine and not message.present:
+            # Its waiters lose their place: a lock must not be granted to a dead process while
+            # living ones wait.  A client that was only cut off asks again with the same id.
+            for tenure in self._state.tenures.of_session(message.session):
+                if tenure.token is None:
+                    self._state.count("waiters_dropped")
+                    yield from self._state.tenures.remove(tenure, now_ns=self._state.now_ns)
+                    self._state.forget_top(tenure.lock)

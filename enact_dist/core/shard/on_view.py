@@ -1,0 +1,192 @@
+"""Views at the shard's door: committed data without a lock, as of now or as of a stamp.
+
+A view over several shards is one cut if all of them answer as of one stamp T: every commit stamped
+up to T is shown, none after it.  The answer says from when to when its data were current; that
+interval ends before the stamp of any commit that is prepared or under way on the viewed slots,
+because such a commit may still become visible with a stamp from there on.  Asked *at* T, a shard
+first moves its clock past T, so that whatever is prepared later gets a larger stamp, and then
+waits for those that are undecided and stamped up to T.
+
+A strict view as of T is about history: it is answered with the data as of T, or with what is
+forgotten of them, and never with the present.  Where an undecided commit still stands in the way
+after the wait, its interval ends before T, and it is to be asked again.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.core.protocol.checks import unknown_world
+from enact_dist.core.protocol.datum import Column, Slot
+from enact_dist.core.protocol.messages import EpochChanged, Forgotten, Refused, TakeView, Viewed
+from enact_dist.core.protocol.records import Reply
+from enact_dist.core.shard.parked import Parked
+from enact_dist.patterns import pattern_matches
+from enact_dist.terms import ACCESSES
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator
+
+    from enact_dist.core.protocol.messages import Item, WriteItem
+    from enact_dist.core.protocol.records import Effect
+    from enact_dist.core.shard.on_lock import LockDesk
+    from enact_dist.core.shard.on_prepare import PrepareDesk
+    from enact_dist.core.shard.state import ShardState
+
+VIEW_WAIT_NS: Final = 400_000_000
+"""How long a view waits for undecided commits; then it is answered, and may be asked again."""
+WAITING_MAX: Final = 2048
+"""Views that wait at one shard; further ones are answered as if they had waited enough."""
+
+
+class ViewDesk:
+    """Everything about views without a lock.
+
+    Attributes:
+        waits: The views that wait for undecided commits.
+    """
+
+    def __init__(self, state: ShardState, locks: LockDesk, prepares: PrepareDesk) -> None:
+        self._state = state
+        self._locks = locks
+        self._prepares = prepares
+        self._parked = Parked[TakeView]()
+        self.waits: Collection[int] = self._parked.by_reply
+        self._behind: dict[int, dict[int, None]] = {}
+        self._behind_of: dict[int, int] = {}
+
+    def on_take_view(self, message: TakeView, reply_to: int) -> Iterator[Effect]:
+        """Show committed data without a lock."""
+        state = self._state
+        session = state.session_in_epoch(message.lock.session, message.epoch)
+        refusal = self._locks.refused(session, message.map_version, message.items)
+        if refusal is not None or session is None:
+            yield Reply(reply_to, refusal or EpochChanged(state.epoch))
+            return
+        if message.at_ns < 0:
+            yield Reply(
+                reply_to, Refused("protocol", f"stamp {message.at_ns} was asked, which is none")
+            )
+            return
+        if message.strict and state.stamps.too_far_ahead(message.at_ns, wall_ns=state.wall_ns):
+            yield Reply(reply_to, self._in_the_future(message.at_ns))
+            return
+        # Whatever is counted renews: the client believes from the newest counter that was seen.
+        session.renewed_ns = max(session.renewed_ns, state.now_ns)
+        session.count_seen = max(session.count_seen, message.count)
+        state.stamp(max(message.seen_stamp_ns, message.at_ns))
+        full = len(self._parked) >= WAITING_MAX
+        if not full and message.at_ns and self._waits(reply_to, message):
+            state.count("views_waited")
+            end_ns = state.now_ns + VIEW_WAIT_NS
+            oldest = self._parked.add(reply_to, message, session=session.session, end_ns=end_ns)
+            if oldest is not None:
+                yield self._answer(oldest, self._parked.take(oldest))
+        else:
+            yield Reply(reply_to, self._viewed(message))
+
+    def _waits(self, reply_to: int, message: TakeView) -> bool:
+        """Whether an undecided commit stands before a view; it waits for the first one then."""
+        undecided_ns = self._undecided_ns(message.items)
+        if undecided_ns > message.at_ns:
+            return False
+        # Here each commit has a stamp of its own.
+        self._behind.setdefault(undecided_ns, {})[reply_to] = None
+        self._behind_of[reply_to] = undecided_ns
+        return True
+
+    def _in_the_future(self, at_ns: int) -> Refused:
+        ahead_s = (at_ns - self._state.wall_ns) / 1e9
+        return Refused(
+            "clock_skew",
+            f"the data were asked as of a time {ahead_s:.1f} s ahead of the clock of shard"
+            f" {self._state.settings.name}; at most 1 s is accepted; ask for a time that has come",
+        )
+
+    def _undecided_ns(self, items: tuple[Item, ...]) -> int:
+        """Return the smallest stamp that an undecided commit on these items may get."""
+        undecided = self._undecided()
+        if not undecided:
+            return _NEVER_NS
+        slots = {Slot(i.context, i.entity, i.aspect) for i in items if not ACCESSES[i.access].each}
+        each = [(Column(i.context, i.aspect), i.entity) for i in items if ACCESSES[i.access].each]
+        return min(
+            (
+                stamp_ns
+                for stamp_ns, writes in undecided
+                if any(write.slot in slots or _in_any(write.slot, each) for write in writes)
+            ),
+            default=_NEVER_NS,
+        )
+
+    def _viewed(self, message: TakeView) -> Viewed | Forgotten:
+        state = self._state
+        if message.strict and message.at_ns:
+            forgotten = state.slots.forgotten(message.items, message.at_ns)
+            if forgotten is not None:
+                state.count("views_forgotten")
+                return forgotten
+        states, pins, from_ns = state.slots.shown(message.items, message.at_ns)
+        if pins and state.pins.add(message.lock, pins):
+            state.count("views_displaced")
+        stamp_ns = state.stamp()
+        until_ns = min(stamp_ns, self._undecided_ns(message.items) - 1)
+        if message.at_ns:
+            # Some of it may be past already, and was current at that stamp for certain.
+            until_ns = min(until_ns, message.at_ns)
+        return Viewed(message.lock, state.epoch, stamp_ns, tuple(states), from_ns, until_ns)
+
+    def answer_parked(self, *, decided: bool) -> Iterator[Effect]:
+        """Answer the views that waited enough, or that nothing undecided stands before any more.
+
+        Args:
+            decided: Whether a commit may have been decided since the last time.
+        """
+        if self._state.draining:
+            for reply_to, message in self._parked.all():
+                yield self._answer(reply_to, message)
+        for reply_to, message in self._parked.ended(self._state.now_ns):
+            yield self._answer(reply_to, message)
+        if decided:
+            undecided = {stamp_ns for stamp_ns, _ in self._undecided()}
+            for stamp_ns in sorted(self._behind.keys() - undecided):
+                for reply_to in self._behind.pop(stamp_ns):
+                    del self._behind_of[reply_to]
+                    if not self._waits(reply_to, self._parked.by_reply[reply_to].question):
+                        yield self._answer(reply_to, self._parked.take(reply_to))
+
+    def _answer(self, reply_to: int, message: TakeView) -> Effect:
+        stamp_ns = self._behind_of.pop(reply_to, None)
+        if stamp_ns is not None:
+            del self._behind[stamp_ns][reply_to]
+            if not self._behind[stamp_ns]:
+                del self._behind[stamp_ns]
+        return Reply(reply_to, self._dropped(message) or self._viewed(message))
+
+    def _undecided(self) -> list[tuple[int, tuple[WriteItem, ...]]]:
+        """Return stamps and writes of the commits that are not decided."""
+        prepared = ((record.stamp_ns, record.writes) for record in self._prepares.undecided())
+        return [*self._state.commits.undecided(), *prepared]
+
+    def _dropped(self, message: TakeView) -> Refused | EpochChanged | None:
+        """Refuse a view whose session, or one of whose contexts, ended while it waited.
+
+        What it showed would stay pinned for a session that has ended.
+        """
+        if self._state.sessions.known(message.lock.session) is None:
+            return EpochChanged(self._state.epoch)
+        worlds = self._state.catalogue.worlds
+        gone = next((item.context for item in message.items if item.context not in worlds), None)
+        return None if gone is None else unknown_world(gone, worlds)
+
+    def next_deadline_ns(self) -> int | None:
+        """Return when a view has waited enough."""
+        return self._parked.next_end_ns()
+
+
+_NEVER_NS: Final = 1 << 62
+
+
+def _in_any(slot: Slot, each: list[tuple[Column, str]]) -> bool:
+    column = Column(slot.context, slot.aspect)
+    return any(column == one and pattern_matches(pattern, slot.entity) for one, pattern in each)

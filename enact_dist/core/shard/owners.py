@@ -1,0 +1,124 @@
+"""Whose session a message speaks for: the identity under which it came decides.
+
+An identity is a short text.  The transport says it with each message (`Shard.handle`), and this
+module is all that asks for it, so that what vouches for an identity may change without the rules.
+Today a client says its own: actor, host and process, in the key of its requests and when it opens
+a socket.  That stops a fault or a stray tool; against malice it needs certificates or users, whose
+name stands in the same place then.
+
+Rules to keep
+
+- The first `Hello` of a session binds it to its identity, on the disk too; everything else that
+  names the session has to come under that identity.  What became of a commit anybody may ask: the
+  session that made it may be gone; once it is, anybody may release its locks before he asks.
+- `Finish`, `Resolve` and a `ListPlaces` that names a shard come from that shard, under
+  `shard_identity`.
+- The identity "" is this process itself: an embedded shard, or a simulated one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from operator import attrgetter
+from typing import TYPE_CHECKING, Final, get_args
+
+from enact_dist.core.protocol.messages import (
+    Break,
+    DropWorld,
+    EpochChanged,
+    Finish,
+    ForceAbort,
+    Fork,
+    Hello,
+    KeepVersions,
+    ListPlaces,
+    Outcome,
+    Refused,
+    Release,
+    Request,
+    Resolve,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from enact_dist.core.protocol.records import Event
+    from enact_dist.core.state.sessions import SessionTable
+
+PERMISSION: Final = "permission"
+"""The code of a refusal because of the sender."""
+_SHARD: Final = "shard."
+
+
+def shard_identity(shard: str) -> str:
+    """Return the identity under which a shard calls the others."""
+    return _SHARD + shard
+
+
+def _session_getter(kind: type) -> Callable[[object], str] | None:
+    fields = {field.name for field in dataclasses.fields(kind)}
+    path = "lock.session" if "lock" in fields else "session" if "session" in fields else ""
+    return attrgetter(path) if path and kind not in (Finish, Resolve) else None
+
+
+SESSION_OF: Final = {kind: _session_getter(kind) for kind in get_args(Request)}
+"""How to read from each request for which session it speaks; None for what speaks for none."""
+_OF_SHARDS: Final = frozenset((Finish, Resolve, ListPlaces))
+_SAY_EPOCH: Final = frozenset((Break, DropWorld, ForceAbort, Fork, KeepVersions))
+
+
+def named_session(message: object) -> str:
+    """Return the session for which a request speaks, or nothing."""
+    getter = SESSION_OF.get(type(message))
+    return getter(message) if getter is not None else ""
+
+
+def refusal(
+    message: Request | Event, identity: str, sessions: SessionTable, epoch: int
+) -> Refused | EpochChanged | None:
+    """Return why a message under this identity is not for the shard to handle, else None."""
+    kind = type(message)
+    getter = SESSION_OF.get(kind)
+    if getter is None:
+        if kind in _OF_SHARDS:
+            return _not_its_shard(message, identity)  # type: ignore[arg-type]  # one of these
+    elif kind is not Outcome:
+        session = getter(message)
+        found = sessions.by_id.get(session)
+        if found is not None and found.identity == identity != "":
+            return None if kind not in _SAY_EPOCH else _says_epoch(message)  # the usual case
+        owner = sessions.owner(session)
+        ended = kind is Release and session not in sessions.by_id  # it takes nothing from anybody
+        if owner and owner != identity and not ended:
+            return not_yours(session, owner, identity)
+        if owner == "" and kind is not Hello and session in sessions.by_id:
+            return EpochChanged(epoch)  # kept by a release that noted no owner: who greets has it
+    return _says_epoch(message) if kind in _SAY_EPOCH else None
+
+
+def _says_epoch(message: Request | Event) -> Refused | None:
+    if message.epoch:  # type: ignore[union-attr]  # those that have to say it have one
+        return None
+    kind = type(message).__name__
+    return Refused("protocol", f"a {kind} came that names no epoch of this shard")
+
+
+def not_yours(session: str, owner: str, asker: str) -> Refused:
+    """Refuse to let one client speak for another's session."""
+    return Refused(
+        PERMISSION,
+        f"session {session[:8]} belongs to {owner}; {asker} asked and may not speak for it",
+    )
+
+
+def _not_its_shard(message: Finish | Resolve | ListPlaces, identity: str) -> Refused | None:
+    if isinstance(message, Finish):
+        named = message.position.shard
+    else:
+        named = message.asker if isinstance(message, Resolve) else message.shard
+        if not named and isinstance(message, ListPlaces):
+            return None
+    if identity == shard_identity(named):
+        return None
+    said = f"{type(message).__name__} in the name of shard {named}"
+    return Refused(PERMISSION, f"{identity} asked a {said}; only that shard itself may")

@@ -1,0 +1,236 @@
+"""The parts of one shard that its desks work on, and the few acts that they share.
+
+`ShardState` decides nothing by itself; `Shard` sets its time before each message and hands it to
+the desk that the message is for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.core.protocol.messages import (
+    AspectEntry,
+    Broken,
+    EpochChanged,
+    PlacementMap,
+    Refused,
+    WorldEntry,
+)
+from enact_dist.core.shard.pins import Pins
+from enact_dist.core.shard.quotas import Quotas
+from enact_dist.core.state.audit import Audit
+from enact_dist.core.state.catalogue import Catalogue
+from enact_dist.core.state.clock import Stamps, newest_stamp
+from enact_dist.core.state.commits import Commits
+from enact_dist.core.state.decisions import Decisions
+from enact_dist.core.state.grants import Tenure, Tenures
+from enact_dist.core.state.sessions import Session, SessionTable
+from enact_dist.core.state.slots import SlotMap
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from enact_dist.core.protocol.datum import LockId
+    from enact_dist.core.protocol.messages import (
+        Answer,
+        Break,
+        DropWorld,
+        ForceAbort,
+        Fork,
+        KeepVersions,
+    )
+    from enact_dist.core.protocol.records import Effect, Recovered
+
+FETCH_BYTES_MAX: Final = 4 << 20
+"""Largest part of a datum in one answer, so that small answers never wait long behind it."""
+
+ANSWER_FETCHES: Final = 2
+"""The small data of one grant may have as many bytes as two fetched parts of a large one."""
+
+
+@dataclass(frozen=True, slots=True)
+class ShardSettings:
+    """What a shard learns from the configuration of its cell.
+
+    Attributes:
+        name: The shard's name.
+        placement: All shards of the cell; the shard itself is one of them.
+        worlds: World contexts that exist from the start.
+        aspects: Aspects whose durability the cell decides; their fingerprints may be empty.
+        ttl_ns_max: Longest lease a session may ask for.
+        fetch_bytes_max: Largest part of a datum in one answer.
+        shared: Name of this start's folder of shared memory ("": it shares none).
+        shared_nonce: Content of its nonce file, for clients.
+        start: A random number of this start.
+    """
+
+    name: str
+    placement: PlacementMap
+    worlds: tuple[str, ...] = ()
+    aspects: tuple[AspectEntry, ...] = ()
+    ttl_ns_max: int = 60_000_000_000
+    fetch_bytes_max: int = FETCH_BYTES_MAX
+    shared: str = ""
+    shared_nonce: bytes = b""
+    start: int = 0
+
+
+class ShardState:
+    """Slots, sessions, locks and commits of one shard at one moment.
+
+    Attributes:
+        now_ns: Monotonic time of the message being handled.
+        asker: The identity under which it came; "": this process.
+        wall_ns: Wall clock at that moment; for timestamps only.
+        peers: The other shards of the cell.
+        pins: Data that a view without a lock keeps fetchable.
+        busy_worlds: The operation in progress on a context of this name, which is unusable
+            meanwhile.
+        by_hand: The last lock broken and the last one aborted by operators: request and answer.
+        draining: The shard is about to stop and grants nothing.
+        doubled: The shards of the cell that several daemons serve now, with the start of each.
+    """
+
+    def __init__(
+        self, settings: ShardSettings, recovered: Recovered, *, now_ns: int, wall_ns: int
+    ) -> None:
+        self.settings = settings
+        self.epoch = recovered.epoch
+        self.now_ns, self.wall_ns, self.born_ns = now_ns, wall_ns, now_ns
+        self.asker = ""
+        self.draining = False
+        self.counters: dict[str, int] = {}
+        self.pins = Pins()
+        self.busy_worlds: dict[str, str] = {}
+        self.doubled: dict[str, tuple[int, ...]] = {}
+        self.by_hand: dict[type, tuple[Break | ForceAbort, Broken]] = {}
+        names = {shard.name for shard in settings.placement.shards}
+        self.peers = frozenset(names - {settings.name})
+        self.catalogue = Catalogue(
+            configured=settings.aspects,
+            recovered=recovered.aspects,
+            # Contexts that were only configured once have data, which must stay in reach.
+            worlds=(
+                *map(WorldEntry, settings.worlds),
+                *map(WorldEntry, dict.fromkeys(r.slot.context for r in recovered.slots)),
+                *(WorldEntry(r.name, r.source, r.at_ns) for r in recovered.worlds),
+            ),
+        )
+        self.stamps = Stamps(newest_stamp(recovered)[0])
+        self.slots = SlotMap(
+            recovered.slots,
+            policies=self.catalogue.policies,
+            since_ns=max(self.stamps.last_ns, wall_ns),
+            answer_bytes_max=ANSWER_FETCHES * settings.fetch_bytes_max,
+            dropped=recovered.dropped,
+            forgotten=recovered.forgotten,
+        )
+        self.slots.recover_history(recovered.history, recovered.kept)
+        self.sessions = SessionTable(recovered.sessions, outcomes=recovered.outcomes, now_ns=now_ns)
+        self.tenures = Tenures(
+            epoch=self.epoch, slots=self.slots, sessions=self.sessions, count=self.count
+        )
+        self.quotas = Quotas(self.count)
+        self.audit = Audit(recovered.audit)
+        self.decisions = Decisions(recovered.decisions, now_ns=now_ns, count=self.count)
+        self.commits = Commits(
+            shard=settings.name,
+            peers=self.peers,
+            epoch=self.epoch,
+            slots=self.slots,
+            catalogue=self.catalogue,
+            sessions=self.sessions,
+            tenures=self.tenures,
+            stamps=self.stamps,
+            decisions=self.decisions,
+            count=self.count,
+        )
+
+    def count(self, name: str, count: int = 1) -> None:
+        """Add to one of the shard's statistics."""
+        self.counters[name] = self.counters.get(name, 0) + count
+
+    def session_in_epoch(self, session: str, epoch: int) -> Session | None:
+        """Return the session if it and the client's idea of the epoch are current."""
+        if epoch != self.epoch:
+            self.count("epoch_refusals")
+            return None
+        return self.sessions.known(session)
+
+    def answered_before(self, message: Fork | DropWorld | KeepVersions) -> Answer | None:
+        """Return what a copy of an earlier request is answered, None to what is new or under way.
+
+        A session asks for one after the other, each with a larger count (0 with its epoch: unsaid).
+        """
+        if not message.epoch:
+            return None
+        session = self.session_in_epoch(message.session, message.epoch)
+        if session is None:
+            return EpochChanged(self.epoch)
+        session.renewed_ns = max(session.renewed_ns, self.now_ns)
+        session.count_seen = max(session.count_seen, message.count)
+        count, answer = session.act
+        if message.count > count:
+            session.act = (message.count, None)
+            return None
+        if message.count == count:
+            return answer
+        return Refused("overload", "the request came after a newer one of its session; ask again")
+
+    def remember_answer(self, message: Fork | DropWorld | KeepVersions, answer: Answer) -> None:
+        """Let a copy of a request be answered as the request was."""
+        session = self.sessions.by_id.get(message.session)
+        if session is not None and session.act[0] == message.count:
+            session.act = (message.count, answer)
+
+    @property
+    def shortest_ttl_ns(self) -> int:
+        """Of all sessions; bounds how often the shard must look at the time."""
+        return self.sessions.shortest_ttl_ns or self.settings.ttl_ns_max
+
+    @property
+    def grants(self) -> bool:
+        """Whether locks are granted now: not in the grace after a start, not before an end."""
+        return not self.draining and not self.sessions.in_grace(self.now_ns)
+
+    def grant_ready(self) -> Iterator[Effect]:
+        """Grant whatever may be granted now."""
+        if self.grants:
+            yield from self.tenures.grant_ready(now_ns=self.now_ns, stamp_ns=self.stamp())
+
+    def stamp(self, seen_ns: int = 0) -> int:
+        """Return the present, after everything that an honest client has seen."""
+        if seen_ns > self.stamps.last_ns and not self.stamps.too_far_ahead(
+            seen_ns, wall_ns=self.wall_ns
+        ):
+            self.stamps.last_ns = seen_ns
+        return self.stamps.now(wall_ns=self.wall_ns)
+
+    def forget_top(self, lock: LockId) -> None:
+        """Let a lock that never was granted be asked for again under the same seq."""
+        session = self.sessions.by_id.get(lock.session)
+        if session is not None and session.lane(lock.lane).top == lock.seq:
+            session.lane(lock.lane).top = lock.seq - 1
+
+    def busy_world(self, world: str) -> Refused | None:
+        """Refuse the name of a context that is just being made or dropped."""
+        act = self.busy_worlds.get(world)
+        if act is None:
+            return None
+        return Refused("overload", f"world context {world!r} is {act}; ask again")
+
+    def numbered(self, number: int, epoch: int) -> Tenure | None:
+        """Return the lock with a number that people saw in an epoch (0: this one)."""
+        if epoch not in (0, self.epoch):
+            return None
+        found = (t for t in self.tenures.by_lock.values() if t.claim.ticket == number)
+        return next(found, None)
+
+    def told_by_hand(self, message: Break | ForceAbort) -> Broken:
+        """Return the answer to an operator's request to end a lock that does not exist.
+
+        A repeated request (the client timed out on a slow disk) gets the original answer.
+        """
+        asked, answer = self.by_hand.get(type(message), (None, None))
+        return answer if answer is not None and asked == message else Broken(False, None)

@@ -1,0 +1,126 @@
+"""Hybrid logical time of one shard: the stamps of its commits (Kulkarni et al. 2014).
+
+A stamp is the shard's wall clock in nanoseconds where that moves on, else one more than the last
+stamp; and it exceeds every stamp that the committing client had seen, so that cause comes before
+effect over all shards without synchronised clocks.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from enact_dist.core.protocol.records import Recovered
+
+BOUNDS_S: Final = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 10.0)
+"""Upper bounds of the classes, seconds."""
+
+
+class Latencies:
+    """How long something took, counted in classes.  One thread at a time adds, any may read.
+
+    Attributes:
+        counts: One for each of `BOUNDS_S`, and one for what took longer.
+        sum_s: Of all durations.
+    """
+
+    __slots__ = ("counts", "sum_s")
+
+    def __init__(self) -> None:
+        self.counts = [0] * (len(BOUNDS_S) + 1)
+        self.sum_s = 0.0
+
+    def add(self, took_s: float) -> None:
+        """Count one duration."""
+        self.counts[bisect_left(BOUNDS_S, took_s)] += 1
+        self.sum_s += took_s
+
+
+UNKEPT_FROM: Final = 10**11
+"""Epochs from here on are milliseconds since 1970, of shards that keep nothing; lower ones are
+seconds, or one more than the epoch before, of shards that do."""
+
+
+def unkept_epoch(wall_ns: int) -> int:
+    """Return the epoch of a shard that keeps nothing, so knows none before.
+
+    It grows by the millisecond: two starts may come within a second.
+    """
+    return wall_ns // 1_000_000
+
+
+def is_kept(epoch: int) -> bool:
+    """Whether a shard has begun this epoch with what it had kept of the one before."""
+    return epoch < UNKEPT_FROM
+
+
+def state_of(*, grants: bool, draining: bool) -> str:
+    """Say in words whether a shard grants locks, and if not, why."""
+    if grants:
+        return "open"
+    return "drains" if draining else "waits for older leases"
+
+
+AHEAD_NS_MAX: Final = 1_000_000_000
+"""A stamp from elsewhere may lie this far ahead of our wall clock; more is a wrong clock."""
+STAMP_NS_MAX: Final = 1 << 62
+"""No stamp lies beyond this, the year 2116: from there on, clocks could not count for long."""
+
+
+def newest_stamp(recovered: Recovered) -> tuple[int, str]:
+    """Return the largest stamp of what a store has kept, and what has it; 0 where nothing is."""
+    stamps = [(record.stamp_ns, f"slot {record.slot}") for record in recovered.slots]
+    # A fork without slots here was made as of then, too: nothing may be committed before.
+    stamps += [(record.at_ns, f"world context {record.name}") for record in recovered.worlds]
+    # Nor before what was forgotten with its aspect.
+    stamps += [(record.at_ns, f"forgotten aspect {record.name}") for record in recovered.forgotten]
+    stamps += [(one.position.stamp_ns, f"commit {one.lock}") for one in recovered.outcomes]
+    stamps += [
+        (record.position.stamp_ns, f"commit {record.lock}") for record in recovered.decisions
+    ]
+    stamps += [(record.stamp_ns, f"prepared lock {record.lock}") for record in recovered.prepared]
+    return max(stamps, default=(0, "nothing"))
+
+
+class Stamps:
+    """The clock of one shard.  Strictly increasing."""
+
+    __slots__ = ("_wall_ahead_ns", "_wall_ns_max", "last_ns")
+
+    def __init__(self, last_ns: int) -> None:
+        self.last_ns = last_ns
+        self._wall_ahead_ns: int | None = None
+        self._wall_ns_max = 0
+
+    def passes(self, *, now_ns: int, wall_ns: int) -> None:
+        """Note the time: where the wall clock would be now if it had never been set back.
+
+        Other shards of this host have stamped by the clock as it was: until their stamps are past
+        again, what they have decided must not count as far ahead here.
+        """
+        ahead_ns = wall_ns - now_ns
+        if self._wall_ahead_ns is None or ahead_ns > self._wall_ahead_ns:
+            self._wall_ahead_ns = ahead_ns
+        self._wall_ns_max = now_ns + self._wall_ahead_ns
+
+    def too_far_ahead(self, seen_ns: int, *, wall_ns: int) -> bool:
+        """Whether a stamp from elsewhere would drag this clock away from the wall clock.
+
+        Times that this clock or the wall clock has given are never too far ahead.
+        """
+        return seen_ns > max(max(wall_ns, self._wall_ns_max) + AHEAD_NS_MAX, self.last_ns)
+
+    def next(self, *, seen_ns: int, wall_ns: int) -> int:
+        """Return the stamp of a new commit by a client that has seen stamps up to `seen_ns`."""
+        self.last_ns = max(self.last_ns + 1, seen_ns + 1, wall_ns)
+        return self.last_ns
+
+    def saw(self, stamp_ns: int) -> None:
+        """Come after a stamp that was decided elsewhere."""
+        self.last_ns = max(self.last_ns, stamp_ns)
+
+    def now(self, *, wall_ns: int) -> int:
+        """Return the present; every later commit gets a larger stamp."""
+        self.last_ns = max(self.last_ns, wall_ns)
+        return self.last_ns

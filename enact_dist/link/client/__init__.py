@@ -1,0 +1,1 @@
+"""The client of a cell: connections to its shards, calls, catalogue, payloads."""

@@ -1,0 +1,85 @@
+"""Lanes: small numbers for the threads of a session that hold or await a lock at the same time.
+
+A shard keeps a few facts per lane (the exactly-once table), so their number is bounded.  Any thread
+may reuse a lane after its lock has ended.
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections import deque
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.core.protocol.datum import LockId
+from enact_dist.core.state.sessions import LANES_MAX
+from enact_dist.errors import MisuseError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+_NAME: Final = re.compile(r"(?P<session>[^.@]+)\.(?P<lane>\d+)\.(?P<seq>\d+)@(?P<shard>.+)\Z")
+
+
+def name_of(lock: LockId, writes: Mapping[str, Sequence[object]]) -> str:
+    """Return the name of a lock that commits `writes`, by shard: the lowest shard decides."""
+    primary = min((shard for shard, items in writes.items() if items), default="")
+    return f"{lock.session}.{lock.lane}.{lock.seq}@{primary}" if primary else str(lock)
+
+
+def read_name(name: str) -> tuple[LockId, str]:
+    """Return the lock of a name, and the shard that decides on it.
+
+    Raises:
+        MisuseError: The name is invalid.
+    """
+    found = _NAME.match(name)
+    if found is None:
+        raise MisuseError(f"{name!r} names no lock; use the lock_id of a CommitUnknownError")
+    return LockId(found["session"], int(found["lane"]), int(found["seq"])), found["shard"]
+
+
+KEPT_MAX: Final = 64
+"""Lanes kept unused after an unanswered commit, since a new lock would erase its outcome."""
+
+
+class Lanes:
+    """The lanes of one session.  Thread-safe."""
+
+    def __init__(self) -> None:
+        self._mutex = threading.Lock()
+        self._free: list[int] = []
+        self._kept: deque[int] = deque()
+        self._made = 0
+
+    def take(self) -> int:
+        """Return a lane that no live lock uses.
+
+        Raises:
+            MisuseError: The session already holds or awaits its maximum of locks.
+        """
+        try:
+            return self._free.pop()
+        except IndexError:
+            return self._make()
+
+    def _make(self) -> int:
+        with self._mutex:
+            if self._made >= LANES_MAX:
+                raise MisuseError(
+                    f"{LANES_MAX} threads of this process hold or await a lock or view of this"
+                    " cell, the most that one session may; use fewer threads, or several processes"
+                )
+            self._made += 1
+            return self._made - 1
+
+    def give_back(self, lane: int) -> None:
+        """Free the lane; call once per `take`, or two locks would share it."""
+        self._free.append(lane)
+
+    def keep(self, lane: int) -> None:
+        """Keep the outcome of a lane for a while; frees the oldest such lane."""
+        with self._mutex:
+            self._kept.append(lane)
+            if len(self._kept) > KEPT_MAX:
+                self._free.append(self._kept.popleft())

@@ -1,0 +1,113 @@
+"""Checks whether shards are alive and ready, with one query to each, without joining the cell.
+
+It opens no session at a shard, so a check leaves nothing behind.  It imports only Zenoh and the
+wire.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from enact_dist.core.protocol.messages import Ping, Pong
+from enact_dist.errors import ShardUnreachableError
+from enact_dist.link.zenoh.config import to_reach
+from enact_dist.link.zenoh.discovery import FoundShard, ask_shards, find_shards
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+
+@dataclass(frozen=True, slots=True)
+class ShardHealth:
+    """The health of one shard.
+
+    Attributes:
+        name: Its name.
+        alive: It answers.
+        ready: It answers and grants locks.
+        state: "open", "waits for older leases", "drains" or "unreachable".
+        endpoint: Where the query was sent, comma separated.
+        epoch: Changes with every start; 0 if it does not answer.
+        uptime_s: Time since that start.
+        took_s: Duration of the whole check, connections included.
+    """
+
+    name: str
+    alive: bool
+    ready: bool
+    state: str
+    endpoint: str
+    epoch: int = 0
+    uptime_s: float = 0.0
+    took_s: float = 0.0
+
+    def __str__(self) -> str:
+        """Return one line for people."""
+        if not self.alive:
+            return f"{self.name}: unreachable, no answer at {self.endpoint} in {self.took_s:.1f} s"
+        word = "ready" if self.ready else "alive, not ready"
+        return f"{self.name}: {word} ({self.state}), epoch {self.epoch}, up {self.uptime_s:.0f} s"
+
+
+def of_shards(
+    cell: str, endpoints: Mapping[str, Sequence[str]], *, timeout_s: float
+) -> list[ShardHealth]:
+    """Ask shards of a cell, given by name, each with its endpoints.
+
+    Raises:
+        ConfigError: An endpoint cannot be read.
+        ProtocolError: An answer cannot be read.
+    """
+    started_s = time.monotonic()
+    reached = {name: list(dict.fromkeys(map(to_reach, some))) for name, some in endpoints.items()}
+    everywhere = list(dict.fromkeys(endpoint for some in reached.values() for endpoint in some))
+    shards = [FoundShard(cell, name) for name in reached]
+    answers = ask_shards(everywhere, shards, Ping(), timeout_s=timeout_s)
+    took_s = time.monotonic() - started_s
+    return [
+        _health(shard.shard, answers.get(shard), ", ".join(reached[shard.shard]), took_s)
+        for shard in shards
+    ]
+
+
+def of_endpoint(endpoint: str, name: str | None, *, timeout_s: float) -> list[ShardHealth]:
+    """Ask the shards at one endpoint, or only the one called `name`.
+
+    Raises:
+        ConfigError: The endpoint cannot be read.
+        ShardUnreachableError: No shard answers there, or not the one named.
+        ProtocolError: An answer cannot be read.
+    """
+    started_s = time.monotonic()
+    found = find_shards([endpoint], timeout_s=timeout_s)
+    wanted = [shard for shard in found if name in (None, shard.shard)]
+    if not wanted:
+        there = ", ".join(shard.shard for shard in found)
+        raise ShardUnreachableError(
+            f"no shard {name or ''} answers at {endpoint} (waited {timeout_s:g} s)".replace(
+                "  ", " "
+            )
+            + (f"; there is {there}" if there else "; is one running there? (enact shard run)"),
+            shard=name or "",
+            endpoint=endpoint,
+        )
+    answers = ask_shards([endpoint], wanted, Ping(), timeout_s=timeout_s)
+    took_s = time.monotonic() - started_s
+    return [_health(shard.shard, answers.get(shard), endpoint, took_s) for shard in wanted]
+
+
+def _health(name: str, answer: object, endpoint: str, took_s: float) -> ShardHealth:
+    if not isinstance(answer, Pong):
+        return ShardHealth(name, False, False, "unreachable", endpoint, took_s=took_s)
+    return ShardHealth(
+        name,
+        alive=True,
+        ready=answer.open,
+        state=answer.state,
+        endpoint=endpoint,
+        epoch=answer.epoch,
+        uptime_s=answer.uptime_ns / 1e9,
+        took_s=took_s,
+    )

@@ -1,0 +1,258 @@
+"""The metrics that a shard serves to Prometheus: counters and gauges, in text format 0.0.4.
+
+Each counter of `link.daemon.counters` becomes ``enact_NAME_total``, and each current value
+``enact_NAME``, with the meaning given there as help text.  All samples have the labels `cell` and
+`shard`. The table in `deploy/metrics.md` is `table()`.
+
+Serves one page over HTTP, from threads that never block the shard.
+
+A slow reader occupies one of `READERS_MAX` threads, for at most `READ_S` per step; further readers
+are refused.  While the process has no free descriptor, new connections stay in the queue and are
+tried again after a pause.
+"""
+
+from __future__ import annotations
+
+import logging
+import socket
+import threading
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler
+from itertools import accumulate
+from socketserver import TCPServer, ThreadingMixIn
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
+
+from enact_dist.core.state.clock import BOUNDS_S
+from enact_dist.errors import LinkError
+from enact_dist.link.daemon.counters import BODIES, OF_A_SHARD
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from enact_dist.core.state.clock import Latencies
+    from enact_dist.link.host import ShardHost
+
+READERS_MAX: Final = 8
+READ_S: Final = 5.0
+PATH: Final = "/metrics"
+POLL_S: Final = 0.1
+"""How long `close` may wait for the thread that accepts."""
+PAUSE_S_MIN: Final = 0.05
+PAUSE_S_MAX: Final = 1.0
+"""Pause after a connection that could not be accepted; doubles up to the second figure."""
+
+_log = logging.getLogger("enact.link")
+
+
+class MetricsServer:
+    """Answers ``GET /metrics`` until it is closed.
+
+    Args:
+        address: Host and port; port 0 takes any that is free.
+        page: Returns the page; called from the server's threads.
+        count: Called with "metrics_readers_refused" for each refused reader.
+
+    Attributes:
+        port: The port on which it listens.
+
+    Raises:
+        LinkError: The address is in use, or not an address of this host.
+    """
+
+    def __init__(
+        self, address: tuple[str, int], page: Callable[[], str], count: Callable[[str], None]
+    ) -> None:
+        host, port = address
+        try:
+            self._server = _Server(address, page, count)
+        except OSError as error:
+            raise LinkError(
+                f"metrics cannot be served at {host}:{port}: {error.strerror or error}; name"
+                " another address with --metrics"
+            ) from error
+        self.port: int = self._server.server_address[1]
+        self._thread = threading.Thread(
+            target=lambda: self._server.serve_forever(POLL_S), name="enact-metrics", daemon=True
+        )
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop listening; idempotent."""
+        self._server.ending.set()
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
+
+
+class _Server(ThreadingMixIn, TCPServer):
+    allow_reuse_address = True
+    daemon_threads = True
+    block_on_close = False
+
+    def __init__(
+        self, address: tuple[str, int], page: Callable[[], str], count: Callable[[str], None]
+    ) -> None:
+        self.address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
+        self.page = page
+        self.ending = threading.Event()
+        self._count = count
+        self._pause_s = 0.0
+        self._room = threading.BoundedSemaphore(READERS_MAX)
+        super().__init__(address, _Handler)
+
+    def get_request(self) -> tuple[Any, Any]:
+        """Accept the waiting connection; if the system refuses, the caller retries at once."""
+        try:
+            taken = super().get_request()
+        except OSError as error:
+            if not self._pause_s:
+                _log.warning("cannot accept a reader of the metrics now: %s", error)
+            self._count("metrics_readers_refused")
+            self._pause_s = min(max(2 * self._pause_s, PAUSE_S_MIN), PAUSE_S_MAX)
+            self.ending.wait(self._pause_s)
+            raise
+        self._pause_s = 0.0
+        return taken
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        if not self._room.acquire(blocking=False):
+            self._count("metrics_readers_refused")
+            self.shutdown_request(request)
+            return
+        try:
+            super().process_request(request, client_address)
+        except BaseException:  # the system has no more threads
+            self._room.release()
+            self._count("metrics_readers_refused")
+            raise
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._room.release()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        _log.info("a reader of the metrics at %s left in mid-answer", client_address)
+
+
+class _Handler(BaseHTTPRequestHandler):
+    timeout = READ_S
+    server_version, sys_version = "enact", ""
+
+    def do_GET(self) -> None:
+        if self.path.partition("?")[0] != PATH:
+            self.send_error(HTTPStatus.NOT_FOUND, f"this server has only {PATH}")
+            return
+        body = cast("_Server", self.server).page().encode()
+        self.send_response(HTTPStatus.OK)
+        self.send_header("Content-Type", CONTENT_TYPE)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, format: str, *arguments: object) -> None:  # noqa: A002 - its base's word
+        """Log nothing: requests come every few seconds."""
+
+
+CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
+
+
+class Metric(NamedTuple):
+    """One metric.
+
+    Attributes:
+        name: Its name in Prometheus.
+        kind: "counter", "gauge" or "histogram".
+        meaning: What it measures.
+        remedy: What to do if it grows; empty if growth is normal.
+        figure: Its name in the figures or latencies of a `ShardHost`.
+    """
+
+    name: str
+    kind: str
+    meaning: str
+    remedy: str
+    figure: str
+
+
+_NOW: Final = {
+    "ready": (
+        "1 while the shard grants locks, 0 right after its start and while it shuts down",
+        "",
+    ),
+    "epoch": ("number of this start; it changes with each restart", "the shard's log says why"),
+    "uptime_seconds": ("time since this start", ""),
+    "sessions": ("clients that are connected, or were until a moment ago", ""),
+    "slots": ("slots on this shard, including null ones", ""),
+    "slot_bytes": (
+        f"bytes of the newest data of all slots: {BODIES}",
+        "enact world tree shows each",
+    ),
+    "locks_held": ("locks held now", ""),
+    "locks_waiting": ("locks waiting now", "enact lock ls shows who holds them up"),
+    "requests_parked": ("requests waiting for an answer", ""),
+}
+_TOOK: Final = {
+    "lock_wait_seconds": (
+        "time from the first request of a lock to its grant here",
+        "enact lock ls shows the holders; hold locks for less time, or use View",
+    ),
+    "store_write_seconds": (
+        "time to store a batch of records, on the disk if an aspect is durable",
+        "move the shard's folder to a faster disk",
+    ),
+}
+
+
+def _metrics() -> Iterator[Metric]:
+    for name, (meaning, remedy) in _NOW.items():
+        yield Metric(f"enact_{name}", "gauge", meaning, remedy, name)
+    for name, counter in OF_A_SHARD.items():
+        kind, ending = ("gauge", "") if counter.now else ("counter", "_total")
+        yield Metric(f"enact_{name}{ending}", kind, counter.meaning, counter.remedy, name)
+    for name, (meaning, remedy) in _TOOK.items():
+        yield Metric(f"enact_{name}", "histogram", meaning, remedy, name)
+
+
+METRICS: Final = tuple(_metrics())
+"""All metrics of a shard, in the order in which it serves them."""
+
+
+def page(host: ShardHost, cell: str) -> str:
+    """Return all metrics of a shard in the format of Prometheus, without locking the shard."""
+    labels = f'cell="{_escaped(cell)}",shard="{_escaped(host.name)}"'
+    figures, latencies = host.figures(), host.latencies()
+    lines: list[str] = []
+    for metric in METRICS:
+        help_ = metric.meaning.replace("\\", r"\\").replace("\n", r"\n")
+        lines += [f"# HELP {metric.name} {help_}", f"# TYPE {metric.name} {metric.kind}"]
+        if metric.kind == "histogram":
+            lines += _histogram(metric.name, labels, latencies[metric.figure])
+        else:
+            lines.append(f"{metric.name}{{{labels}}} {_number(figures.get(metric.figure, 0))}")
+    return "\n".join((*lines, ""))
+
+
+def _histogram(name: str, labels: str, latencies: Latencies) -> Iterator[str]:
+    *totals, count = accumulate(list(latencies.counts))
+    for bound_s, total in zip((*map(_number, BOUNDS_S), "+Inf"), (*totals, count), strict=True):
+        yield f'{name}_bucket{{{labels},le="{bound_s}"}} {total}'
+    yield f"{name}_sum{{{labels}}} {_number(latencies.sum_s)}"
+    yield f"{name}_count{{{labels}}} {count}"
+
+
+def _number(value: float) -> str:
+    return str(int(value)) if value == int(value) else repr(float(value))
+
+
+def _escaped(text: str) -> str:
+    return text.replace("\\", r"\\").replace('"', r"\"").replace("\n", r"\n")
+
+
+def table() -> str:
+    """Return the metrics as a Markdown table."""
+    rows = (f"| `{m.name}` | {m.kind} | {m.meaning} | {m.remedy or '-'} |" for m in METRICS)
+    return "\n".join(
+        ("| metric | kind | meaning | what to do if it grows |", "|---|---|---|---|", *rows, "")
+    )

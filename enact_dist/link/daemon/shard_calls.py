@@ -1,0 +1,290 @@
+"""Calls between shards: the outcome of a prepared lock, and the decision to commit.
+
+Each other shard gets its own Zenoh session and thread at the first call, so that an absent shard
+delays no other.  A call is made once; the core decides on repeating it, and learns when a shard
+comes back.  Callers of `submit` never wait.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from typing import TYPE_CHECKING, Final, cast, get_args
+
+import zenoh
+
+from enact_dist.core.protocol.messages import Answer, Request
+from enact_dist.core.shard.owners import shard_identity
+from enact_dist.errors import ProtocolError
+from enact_dist.link.zenoh.config import close_session, keep_after_fork, open_session
+from enact_dist.link.zenoh.presence import ShardPresence
+from enact_dist.wire.frames import decode_frame, encode_frame
+from enact_dist.wire.keys import request_key, verb_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from enact_dist.core.protocol.messages import ShardEntry
+
+CALL_S: Final = 1.0
+"""How long a call may stay without an answer; the core repeats it anyway."""
+QUEUED_MAX: Final = 10_000
+"""Calls that wait for one shard; further ones are dropped, and repeated later."""
+JOIN_S: Final = 0.5
+"""How long closing waits for all threads."""
+SILENT_S: Final = 5.0
+"""A shard that is silent for this time is logged, once."""
+
+_ANSWERS: Final = frozenset(get_args(Answer))
+_log = logging.getLogger("enact.link")
+
+
+class ShardCalls:
+    """Carries the calls of one shard to the others.  Thread-safe.
+
+    Args:
+        cell: The cell's name.
+        name: The calling shard; its identity is part of the keys.
+        shards: All shards of the cell with their endpoints.
+        lease_s: A connection counts as lost after this time without a sign of life.
+        answered: Called with shard, request and answer, from the thread of that shard.
+        returned: Called from any thread with the name of each previously called shard that comes
+            (back) within reach.
+    """
+
+    def __init__(
+        self,
+        cell: str,
+        name: str,
+        shards: Sequence[ShardEntry],
+        *,
+        lease_s: float,
+        answered: Callable[[str, Request, Answer], None],
+        returned: Callable[[str], None],
+    ) -> None:
+        self._cell, self._name, self._lease_s = cell, name, lease_s
+        self._endpoints = {shard.name: shard.endpoints for shard in shards if shard.name != name}
+        self._answered, self._returned = answered, returned
+        self._mutex = threading.Lock()
+        self._lines: dict[str, _Line] = {}
+        self._unknown: dict[str, None] = {}
+        self._closed = False
+
+    @property
+    def others(self) -> tuple[str, ...]:
+        """The shards that can be called."""
+        return tuple(self._endpoints)
+
+    def submit(self, shard: str, request: Request) -> None:
+        """Queue a call; a call that is already queued is not queued twice."""
+        with self._mutex:
+            if self._closed:
+                return
+            if shard not in self._endpoints:
+                self._tell_unknown(shard)
+                return
+            line = self._lines.get(shard) or self._opened(shard)
+        if line is not None:
+            line.submit(request)
+
+    def _opened(self, shard: str) -> _Line | None:
+        """Return a new line to a shard; None if the system has no more threads."""
+        try:
+            line = _Line(
+                shard,
+                lambda request: request_key(
+                    self._cell, shard, verb_of(request), shard_identity(self._name)
+                ),
+                self._endpoints[shard],
+                self._lease_s,
+                lambda request, answer: self._answered(shard, request, answer),
+                lambda: self._returned(shard),
+            )
+        except RuntimeError as error:
+            _log.warning("no call to shard %s now: %s", shard, error)
+            return None
+        self._lines[shard] = line
+        return line
+
+    def _tell_unknown(self, shard: str) -> None:
+        """Log once that a lock was prepared with a shard that the cell no longer has."""
+        if shard not in self._unknown:
+            self._unknown[shard] = None
+            _log.error(
+                "a lock waits for shard %s, which is not among the shards of this cell (%s): start"
+                " it again, or abort the lock (enact lock resolve --force-abort)",
+                shard,
+                ", ".join(self._endpoints) or "none",
+            )
+
+    def close(self) -> None:
+        """Drop what is queued and end; idempotent."""
+        with self._mutex:
+            self._closed = True
+            lines = list(self._lines.values())
+        for line in lines:
+            line.end()
+        deadline_s = time.monotonic() + JOIN_S
+        for line in lines:
+            line.join(deadline_s - time.monotonic())
+
+
+class _Line:
+    """The connection to one other shard.  After any failure the next calls try again."""
+
+    def __init__(
+        self,
+        shard: str,
+        key_of: Callable[[Request], str],
+        endpoints: tuple[str, ...],
+        lease_s: float,
+        answered: Callable[[Request, Answer], None],
+        returned: Callable[[], None],
+    ) -> None:
+        self._shard = shard
+        self._key_of, self._endpoints, self._lease_s = key_of, endpoints, lease_s
+        self._answered, self._returned = answered, returned
+        self._queued: dict[Request, None] = {}
+        self._wake = threading.Condition(threading.Lock())
+        self._ending = False
+        self._session: zenoh.Session | None = None
+        self._presence: ShardPresence | None = None
+        self._silent_since_s: float | None = None
+        self._silence_told = False
+        keep_after_fork(self)
+        self._thread = threading.Thread(target=self._run, name="enact-calls", daemon=True)
+        self._thread.start()
+
+    def submit(self, request: Request) -> None:
+        with self._wake:
+            if not self._ending and len(self._queued) < QUEUED_MAX:
+                self._queued[request] = None
+                self._wake.notify()
+
+    def _run(self) -> None:
+        try:
+            while (calls := self._next_calls()) is not None:
+                try:
+                    answers = self._answers(calls)
+                except Exception as error:  # noqa: BLE001 - a lock may wait for the next call
+                    answers = []
+                    _log.error("cannot call shard %s: %s", self._shard, error)
+                self._note_silence(answered=bool(answers))
+                for request, answer in answers:
+                    if not self._ending:
+                        self._answered(request, answer)
+        finally:
+            self._close_session()
+
+    def _answers(self, calls: list[Request]) -> list[tuple[Request, Answer]]:
+        """Make calls at once; return those that were answered.
+
+        Raises:
+            EnactError: No call can be made.
+        """
+        session = self._session
+        if session is None:
+            session = self._session = open_session(connect=self._endpoints, lease_s=self._lease_s)
+        if self._presence is None:
+            self._watch(session, self._key_of(calls[0]))
+        sent = [(request, self._send(session, request)) for request in calls]
+        end_s = time.monotonic() + CALL_S
+        received = [(request, _receive(replies, end_s)) for request, replies in sent]
+        return [(request, answer) for request, answer in received if answer is not None]
+
+    def _watch(self, session: zenoh.Session, key: str) -> None:
+        """Watch the shard; on failure the next calls try again, and these are made anyway."""
+        try:
+            self._presence = ShardPresence(session, key, self._tell_returned)
+        except (zenoh.ZError, RuntimeError) as error:  # closed meanwhile, or no thread available
+            if not self._ending:
+                _log.warning("shard %s is not watched at the moment: %s", self._shard, error)
+
+    def _tell_returned(self) -> None:
+        if not self._ending:
+            self._returned()
+
+    def _note_silence(self, *, answered: bool) -> None:
+        """Log once that the shard is away, and once that it is back."""
+        now_s = time.monotonic()
+        if answered:
+            if self._silence_told:
+                _log.info("shard %s answers again", self._shard)
+            self._silent_since_s, self._silence_told = None, False
+            return
+        if self._silent_since_s is None:
+            self._silent_since_s = now_s
+        if not self._silence_told and now_s - self._silent_since_s >= SILENT_S and not self._ending:
+            self._silence_told = True
+            _log.warning(
+                "shard %s at %s does not answer; commits over it and this shard wait for it, and"
+                " keep their locks here (enact lock ls)",
+                self._shard,
+                " or ".join(self._endpoints),
+            )
+
+    def _next_calls(self) -> list[Request] | None:
+        """Wait for calls; return all that are queued, None at the end."""
+        with self._wake:
+            while not self._queued and not self._ending:
+                self._wake.wait()
+            calls, self._queued = list(self._queued), {}
+            return None if self._ending else calls
+
+    def _send(self, session: zenoh.Session, request: Request) -> zenoh.Handler[zenoh.Reply] | None:
+        header, payload = encode_frame(request)
+        try:
+            return session.get(
+                self._key_of(request),
+                payload=payload,
+                attachment=header,
+                timeout=CALL_S,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                priority=zenoh.Priority.INTERACTIVE_HIGH,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+            )
+        except zenoh.ZError:
+            return None
+
+    def end(self) -> None:
+        """Take no more calls and let pending ones end without an answer."""
+        with self._wake:
+            self._ending = True
+            self._wake.notify()
+        self._close_session()
+
+    def join(self, timeout_s: float) -> None:
+        deadline_s = time.monotonic() + timeout_s
+        self._thread.join(max(0.0, timeout_s))
+        if self._presence is not None:
+            self._presence.close(max(0.0, deadline_s - time.monotonic()))
+
+    def _close_session(self) -> None:
+        if self._presence is not None:
+            self._presence.close(0.0)
+        session = self._session
+        if session is not None:
+            close_session(session)
+
+
+def _receive(replies: zenoh.Handler[zenoh.Reply] | None, end_s: float) -> Answer | None:
+    """Return the answer that came, or None; Zenoh itself ends the wait after `CALL_S`."""
+    if replies is None or time.monotonic() > end_s + CALL_S:
+        return None
+    try:
+        sample = replies.recv().ok
+    except zenoh.ZError:  # ended without a reply
+        return None
+    if sample is None:
+        return None
+    header, payload = sample.attachment, sample.payload
+    try:
+        answer = decode_frame(
+            bytes(header) if header is not None else b"",
+            bytes(payload) if payload is not None else b"",
+        )
+    except ProtocolError as error:
+        _log.warning("cannot read another shard's answer: %s", error)
+        return None
+    return cast("Answer", answer) if type(answer) in _ANSWERS else None

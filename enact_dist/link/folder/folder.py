@@ -1,0 +1,292 @@
+"""Checks of a data folder before its rows are read, and the errors that refuse one.
+
+A refusal costs an operator minutes; serving from a damaged store costs trust in all data.  So each
+failed check raises a `StoreError` that names the file and the remedy.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Final, NamedTuple, NoReturn
+
+from enact_dist.core.offline.moving import NAMED_MAX, strangers
+from enact_dist.core.state.clock import AHEAD_NS_MAX, STAMP_NS_MAX, newest_stamp
+from enact_dist.errors import StoreError
+from enact_dist.link.folder.lock import FORMAT_FILE
+from enact_dist.link.folder.mark import MARK_FILE, Mark, read_mark
+from enact_dist.link.folder.wal_check import check_wal
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from enact_dist.core.protocol.messages import PlacementMap
+    from enact_dist.core.protocol.records import Recovered
+
+DATABASE_FILE: Final = "store.db"
+LOG_FILE: Final = "store.db-wal"
+BLOB_FOLDER: Final = "blobs"
+ACCEPT_LOSS_FILE: Final = "accept-loss"
+"""An operator creates it; the one start that it is meant for deletes it."""
+MOVING_FILE: Final = "moving"
+REBALANCE: Final = "rebalance"
+FORGET: Final = "forget"
+_REFUSED_SUFFIX: Final = ".refused"
+
+_RESTORE: Final = (
+    "restore the whole folder from a backup, or give the shard an empty folder and start without"
+    " its data"
+)
+
+_log = logging.getLogger("enact.store")
+
+
+class Found(NamedTuple):
+    """The findings about a folder before its database is opened."""
+
+    mark: Mark | None
+    is_new: bool
+    power_cut: bool
+    """Whether the system has rebooted since the store was last opened."""
+    accepts_loss: bool = False
+    """Whether an operator wants the shard to start although commits may be missing."""
+
+    @property
+    def is_first(self) -> bool:
+        """Whether no earlier start was ever completed: nothing was acknowledged."""
+        return self.mark.is_first if self.mark is not None else self.is_new
+
+
+class MovingMark(NamedTuple):
+    """A mark: entities are being moved from or to a folder, or aspects purged.
+
+    Attributes:
+        number: Identifies the run.
+        shards: All shards whose folders take part.
+        aspects: The purged aspects, each with the timestamp from which on; empty for a rebalance.
+    """
+
+    number: str
+    shards: tuple[str, ...]
+    aspects: Mapping[str, int] = MappingProxyType({})
+
+    @property
+    def what(self) -> str:
+        """The operation in progress, for messages."""
+        return f"forgetting {', '.join(self.aspects)}" if self.aspects else "a rebalance"
+
+
+def way_out(mark: MovingMark) -> str:
+    """Return the command that completes an interrupted run."""
+    command = "enact shard rebalance"
+    if mark.aspects:
+        only = " ".join(f"--shard {name}" for name in mark.shards)
+        command = f"enact shard forget {' '.join(mark.aspects)} {only} --yes"
+    return f"let `{command}` finish"
+
+
+def moving_mark(folder: Path) -> MovingMark | None:
+    """Return the mark of an unfinished run over several folders.
+
+    Raises:
+        StoreError: The mark cannot be read.
+    """
+    path = folder / MOVING_FILE
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        shards = tuple(map(str, found["shards"]))
+        if FORGET in found:
+            aspects = {str(name): int(at_ns) for name, at_ns in found["aspects"].items()}
+            return MovingMark(str(found[FORGET]), shards, aspects)
+        return MovingMark(str(found[REBALANCE]), shards)
+    except FileNotFoundError:
+        return None
+    except (ValueError, TypeError, KeyError, AttributeError):
+        refuse(path, "is damaged")
+
+
+def refuse_moving(folder: Path) -> None:
+    """Refuse a folder in an unfinished rebalance or purge.
+
+    Raises:
+        StoreError: A rebalance or a purge is unfinished.
+    """
+    mark = moving_mark(folder)
+    if mark is not None:
+        refuse(
+            folder,
+            f"is in the midst of {mark.what} with those of {', '.join(mark.shards)}",
+            way_out(mark),
+        )
+
+
+def refuse_strangers(folder: Path, stored: Recovered, shard: str, placement: PlacementMap) -> None:
+    """Refuse a folder with entities that no client would look for there.
+
+    Raises:
+        StoreError: The cell's placement puts some entities on other shards.
+    """
+    found = strangers(stored, shard, placement)
+    if found:
+        named = ", ".join(f"{entity} (of {owner})" for entity, owner in found[:NAMED_MAX])
+        more = f" and {len(found) - NAMED_MAX} more" if len(found) > NAMED_MAX else ""
+        refuse(
+            folder,
+            f"holds entities that cell.toml places on other shards than {shard}: {named}{more}",
+            "move them with `enact shard rebalance` while the cell is stopped, or restore the"
+            " cell's previous shards and pins",
+        )
+
+
+def refuse_far_stamps(folder: Path, stored: Recovered, *, wall_ns: int) -> None:
+    """Refuse a folder whose clock is exhausted; warn of one that is ahead of its host.
+
+    Raises:
+        StoreError: A timestamp exceeds the range of the clock.
+    """
+    stamp_ns, holder = newest_stamp(stored)
+    if stamp_ns > STAMP_NS_MAX:
+        refuse(
+            folder,
+            f"holds {holder} with timestamp {stamp_ns}, after the year 2116: no later commit could"
+            " get a timestamp",
+            "restore a backup from before that commit with `enact shard restore … --replace`, or"
+            " give the shard an empty folder and start without its data",
+        )
+    if stamp_ns > wall_ns + AHEAD_NS_MAX:
+        _log.warning(
+            "%s holds %s with a timestamp %.1f s ahead of this host's clock: until that clock"
+            " catches up, other shards refuse commits together with this one; set the clock, or"
+            " restore a backup from before that commit",
+            folder,
+            holder,
+            (stamp_ns - wall_ns) / 1e9,
+        )
+
+
+def refuse(path: Path, found: str, remedy: str = _RESTORE) -> NoReturn:
+    """Raise the `StoreError` about a damaged file.
+
+    Raises:
+        StoreError: Always.
+    """
+    raise StoreError(f"{path} {found}; the shard does not start: {remedy}", path=str(path))
+
+
+def look_at(folder: Path) -> Found:
+    """Inspect a folder without opening its database.
+
+    Raises:
+        StoreError: The folder has data but no database.
+        OSError: As the system reports it.
+    """
+    mark = read_mark(folder)
+    accepted = (folder / ACCEPT_LOSS_FILE).exists()
+    database = folder / DATABASE_FILE
+    is_new = not database.exists() or database.stat().st_size == 0
+    if is_new:
+        log = folder / LOG_FILE
+        has_log = log.exists() and log.stat().st_size > 0
+        has_mark = mark is not None and not mark.is_first
+        if has_mark or has_log or has_blobs(folder):
+            refuse(database, "is missing or empty, but the folder has been in use")
+    elif mark is None and not accepted:
+        # A new folder gets its mark before its database, so a mark has existed.
+        path = folder / MARK_FILE
+        refuse(
+            path,
+            f"{'cannot be read' if path.exists() else 'is missing'}, and without it nothing shows"
+            " whether acknowledged commits are missing at the end",
+            _accept(folder, "with what can be read"),
+        )
+    return Found(mark, is_new, mark is not None and not mark.same_boot, accepted)
+
+
+def _accept(folder: Path, what: str, first: str = "") -> str:
+    """Return how to start a shard despite a loss."""
+    return (
+        f"restore the whole folder from a backup; or, to go on {what}, keep a copy of the folder,"
+        f" {first}make an empty file '{folder / ACCEPT_LOSS_FILE}', and start the shard"
+    )
+
+
+def holds_store(folder: Path) -> bool:
+    """Whether a shard has ever been started on a folder."""
+    return (folder / FORMAT_FILE).is_file()
+
+
+def has_blobs(folder: Path) -> bool:
+    """Whether the folder has any files of large bodies."""
+    blobs = folder / BLOB_FOLDER
+    return blobs.exists() and any(blobs.iterdir())
+
+
+def check_log(folder: Path, *, power_cut: bool) -> None:
+    """Refuse a log that is damaged in the middle.
+
+    Raises:
+        StoreError: It is damaged, and a power cut does not explain it.
+        OSError: As the system reports it.
+    """
+    log = folder / LOG_FILE
+    verdict = check_wal(log)
+    if verdict.damaged_at is None:
+        return
+    if power_cut:
+        _log.warning(
+            "%s: data from byte %d on, which had not been forced to the disk, are gone after the"
+            " system's restart",
+            log,
+            verdict.damaged_at,
+        )
+        return
+    refuse(
+        log,
+        f"is damaged at byte {verdict.damaged_at}, and acknowledged commits follow",
+        _accept(
+            folder,
+            "without everything written from there on",
+            f"cut the log with 'truncate -s {verdict.damaged_at} {log}', ",
+        ),
+    )
+
+
+def check_reach(folder: Path, found: Found, *, batch: int) -> None:
+    """Refuse a database that ends before the batch in the mark.
+
+    Args:
+        folder: The data folder.
+        found: The findings of `look_at`.
+        batch: Number of the newest batch that was read.
+
+    Raises:
+        StoreError: Acknowledged batches are missing.
+        OSError: As the system reports it.
+    """
+    needed = found.mark.needed() if found.mark is not None else None
+    if found.is_new or (needed is not None and batch >= needed):
+        return
+    log = folder / LOG_FILE
+    if found.accepts_loss:
+        missing = "an unknown number of" if needed is None else needed - batch
+        _log.critical(
+            "%s orders a start despite losses: the last readable batch is %d, and %s batches"
+            " of acknowledged commits may be lost",
+            folder / ACCEPT_LOSS_FILE,
+            batch,
+            missing,
+        )
+        return
+    readable = check_wal(log)
+    if log.exists() and log.stat().st_size:
+        # Closing the database cuts the log to its readable part; the rest is evidence.
+        shutil.copyfile(log, log.with_name(log.name + _REFUSED_SUFFIX))
+    refuse(
+        log,
+        f"is cut or damaged from byte {readable.end} on: batch {needed} was"
+        f" acknowledged, but the last readable one is {batch}",
+        _accept(folder, "without the missing commits"),
+    )

@@ -1,0 +1,1 @@
+"""Payloads in shared memory: maps, their names, and who may release them."""

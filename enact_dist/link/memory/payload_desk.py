@@ -1,0 +1,498 @@
+"""Payloads at a shard: large data that arrived, or were written, ahead of their commit.
+
+::
+
+    Stage(total) ──> draft ── filled by a client of this host in the shared folder,
+                       │      or by slices that come in Stage messages
+    Commit, Prepare ───┴──> adopted: read-only, its bytes become the body of the datum
+    last datum gone ──────> the file is removed; processes that have mapped it keep its content
+
+The desk works in front of the shard: the core sees bodies and never learns where they are stored.
+A payload lasts as long as its bytes are in use, a draft as long as its client.
+
+Rules that a change must keep:
+
+- A name is used once.  Readers learn of a payload only after its commit, so nobody reads a
+  half-filled one.
+- Bytes count against the limit from before the file is made until it is gone.
+- A client that still has a draft mapped for writing could change it after the commit.  Our client
+  hands out read-only arrays from then on and detaches itself some milliseconds later; a hostile one
+  of the same user could do worse.
+- In a folder of a group, whose users may write files that the shard makes for them, only the client
+  learns the name of its draft, and names cannot be listed; the draft gets its payload's name when
+  it becomes read-only.  Two gaps remain: a hostile client can change its own payload after the
+  commit, and a user of the group can read payloads whose names he knows, as he can by asking the
+  shard.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import secrets
+import threading
+import weakref
+from collections import Counter
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import TYPE_CHECKING, Final, TypeVar
+
+from enact_dist.core.protocol.messages import Refused, Staged, WriteItem
+from enact_dist.link.clock import Clock, SystemClock
+from enact_dist.link.memory.maps import Pages, Plain, body_of, leftovers, map_file, plain_memory
+from enact_dist.link.memory.names import UsedNames
+from enact_dist.wire.limits import BODY_BYTES_MAX, PAYLOAD_BYTES_MIN, PAYLOAD_NAME
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from enact_dist.core.protocol.datum import Datum
+    from enact_dist.core.protocol.messages import Commit, Prepare, Stage
+    from enact_dist.link.memory.shared_folder import SharedFolder
+
+    _Written = TypeVar("_Written", Commit, Prepare)
+
+GAPS_MAX: Final = 1024
+"""Slices of one draft that may arrive before a preceding one."""
+NO_ROOM: Final = "no_room"
+"""The code of a refusal for lack of room."""
+DRAFT_NS: Final = 30_000_000_000
+"""A draft of a session without a lock is dropped after this time without a slice."""
+FULL_NS: Final = 100_000_000
+"""After a payload did not fit, the desk frees no room for one as large during this time."""
+DRAFT_BYTES_MAX: Final = 2 << 30
+"""Bytes of drafts in plain memory that may wait for their commits."""
+SHARES: Final = 4
+"""Each client always has a quarter of the room for drafts; more only while others need none."""
+ROOM_S: Final = 1.0
+"""How long a new draft waits for files that are being removed."""
+SILENT_NS: Final = 60_000_000_000
+"""Shortest time between two log lines about payloads outside the folder; all are counted."""
+ROOM_TRIES: Final = 8
+"""How often history is removed for a draft, more each time, while others take that room."""
+
+_log = logging.getLogger("enact.shard")
+
+
+@dataclass(slots=True)
+class _Draft:
+    """A payload that no commit has named yet."""
+
+    session: str
+    owner: str
+    size: int
+    memory: Pages | Plain
+    shared: bool
+    touched_ns: int
+    have: int = 0
+    writing: int = 0
+    beyond: list[tuple[int, int]] = field(default_factory=list)
+
+    def add(self, begin: int, end: int) -> None:
+        """Note the arrival of a slice, perhaps repeated or ahead of an earlier one."""
+        self.beyond.append((begin, end))
+        self.beyond.sort()
+        while self.beyond and self.beyond[0][0] <= self.have:
+            self.have = max(self.have, self.beyond.pop(0)[1])
+
+    @property
+    def whole(self) -> bool:
+        """Whether all of it is here: from slices or, without any, from its client in the folder.
+
+        False while a slice is being written: nothing may change once a commit has it.
+        """
+        if self.writing:
+            return False
+        return self.have == self.size or (self.shared and not self.have and not self.beyond)
+
+
+class PayloadDesk:
+    """The payloads of one shard.  Thread-safe; never waits for the shard.
+
+    Args:
+        folder: Where clients of this host find them; None: they stay in this process.
+        bytes_max: Byte limit of the files, drafts included; without a folder, of the drafts.
+        firm: Whether a payload beyond the limit is refused; otherwise it goes to plain memory.
+        make_room: Called to remove history until so many bytes are free.
+        biggest: Names the largest slots, for the text of a refusal.
+        clock: Measures how long a draft has had no slice.
+
+    Attributes:
+        counters: Counters by name, for `ListSessions`.
+    """
+
+    def __init__(
+        self,
+        folder: SharedFolder | None,
+        bytes_max: int,
+        *,
+        firm: bool = True,
+        make_room: Callable[[int], None] = lambda _: None,
+        biggest: Callable[[], str] = lambda: "",
+        clock: Clock | None = None,
+    ) -> None:
+        self.counters: dict[str, int] = {}
+        self._folder = folder
+        self._bytes_max = bytes_max
+        self._firm = firm
+        self._draft_bytes_max = bytes_max if folder is None else DRAFT_BYTES_MAX
+        self._make_room = make_room
+        self._biggest = biggest
+        self._clock: Clock = clock or SystemClock()
+        self._mutex = threading.RLock()  # reentrant: a destructor may run anywhere
+        self._opening = tuple(threading.Lock() for _ in range(16))
+        self._drafts: dict[str, _Draft] = {}
+        self._names: dict[str, str] = {}
+        self._files = 0
+        self._adopted: dict[str, weakref.ref[Pages | Plain]] = {}
+        self._over = UsedNames()
+        self._bytes = self._gone = 0
+        self._full = 0, 0
+        self._silent_until_ns = 0
+
+    # ---------------------------------------------------------------- drafts
+
+    def stage(self, message: Stage, owner: str = "") -> Staged | Refused:
+        """Open a draft, take a slice of one, or drop one.
+
+        Args:
+            message: A slice, or a request for room.
+            owner: The identity whose share of the room it takes; default: the session's.
+        """
+        file, total = message.file, message.total
+        if not PAYLOAD_NAME.match(file) or not file.startswith(f"{message.session}-"):
+            return Refused("protocol", f"{file[:80]!r} is no payload of session {message.session}")
+        if not total:
+            self.drop(file)
+            return Staged(file, 0, shared=False)
+        with self._mutex:
+            if file in self._over:
+                return Staged(file, total, False)  # a late copy that no client waits for
+        if not 0 < total <= BODY_BYTES_MAX:
+            return Refused("protocol", f"a payload of {total} bytes; at most {BODY_BYTES_MAX}")
+        draft: _Draft | Refused | None = self._drafts.get(file)
+        if draft is None:
+            # Slices of one draft may come from several threads.
+            with self._opening[hash(file) % len(self._opening)]:
+                draft = self._drafts.get(file) or self._opened(
+                    message.session, owner or message.session, file, total
+                )
+        if draft is None:
+            return Staged(file, total, False)
+        if isinstance(draft, Refused):
+            return draft
+        if draft.size != total:
+            return Refused("protocol", f"payload {file} has {draft.size} bytes, not {total}")
+        return self._take(file, draft, message.offset, message.body)
+
+    def _take(self, file: str, draft: _Draft, offset: int, slice_: Datum) -> Staged | Refused:
+        end = offset + slice_.size
+        if not 0 <= offset <= end <= draft.size:
+            return Refused(
+                "protocol", f"a slice up to {end} of payload {file} of {draft.size} bytes"
+            )
+        if len(draft.beyond) >= GAPS_MAX:
+            return Refused("protocol", f"{GAPS_MAX} slices of payload {file} came ahead of others")
+        with self._mutex:
+            draft.touched_ns = self._clock.monotonic_ns()
+            if self._drafts.get(file) is not draft:
+                return Staged(file, draft.size, False)  # a late copy, as in `stage`
+            if not slice_.size or end <= draft.have:
+                return Staged(file, draft.have, draft.shared, self._names.get(file, ""))
+            draft.writing += 1
+        try:
+            body_of(draft.memory)[offset:end] = slice_.body
+        except BaseException:
+            with self._mutex:
+                draft.writing -= 1
+            raise
+        with self._mutex:
+            draft.writing -= 1
+            draft.add(offset, end)
+            return Staged(file, draft.have, draft.shared, self._names.get(file, ""))
+
+    def _opened(self, session: str, owner: str, file: str, total: int) -> _Draft | Refused | None:
+        """Return a new draft; None if its name has been used meanwhile."""
+        small = total <= PAYLOAD_BYTES_MIN  # often many together, and read with the grant
+        shared = self._folder is not None and not small and self._has_room(total)
+        if not shared and self._folder is not None and not small and self._firm:
+            shared = self._displaced(owner, total, shared=True) and self._reserved(total)
+            if not shared:
+                return self._refused(session, total, self._bytes, self._bytes_max)
+        if self._folder is not None and not shared and not small:
+            self._travels(f"its limit of {self._bytes_max} bytes is reached")
+        memory = self._in_folder(self._folder, file, total) if shared else None
+        if memory is None:
+            drafted = self._drafted()
+            full = drafted + max(total, PAYLOAD_BYTES_MIN) > self._draft_bytes_max
+            if full and not self._displaced(owner, total, shared=False):
+                return self._refused(session, total, drafted, self._draft_bytes_max)
+        try:
+            found = memory or plain_memory(total, ended=partial(self._ended, file, None, 0))
+        except OSError as error:
+            self._count("payloads_refused")
+            return Refused(NO_ROOM, f"no memory for a payload of {total} bytes: {error.strerror}")
+        draft = _Draft(session, owner, total, found, memory is not None, self._clock.monotonic_ns())
+        with self._mutex:
+            if file in self._over:
+                return None
+            self._drafts[file] = draft
+        return draft
+
+    def _has_room(self, total: int) -> bool:
+        """Count the bytes of a new file if they fit under the limit, removing history if needed."""
+        if self._reserved(total):
+            return True
+        until_ns, least = self._full
+        if self._clock.monotonic_ns() < until_ns and total >= least:
+            return False  # searching all history again would only delay others
+        asked = 0
+        for _ in range(ROOM_TRIES):
+            gone = self._gone
+            missing = self._bytes + (asked + 1) * total - self._bytes_max
+            if missing > 0:  # otherwise room has been freed meanwhile
+                self._make_room(missing)
+                asked += 1
+            # Released data take a moment to disappear.
+            leftovers().wait(ROOM_S)
+            if self._reserved(total):
+                return True
+            if missing > 0 and self._gone == gone:
+                break  # no more history to remove; otherwise another payload took the room
+        self._full = self._clock.monotonic_ns() + FULL_NS, total
+        return False
+
+    def _reserved(self, total: int) -> bool:
+        with self._mutex:
+            if self._bytes + total > self._bytes_max:
+                return False
+            self._bytes += total
+            self._files += 1
+            return True
+
+    def _displaced(self, owner: str, total: int, *, shared: bool) -> bool:
+        """Drop drafts of clients beyond their share for one within its share; return if any.
+
+        Otherwise a client that only stages and never commits would fill the folder.  A client that
+        still wanted its draft learns of the loss at its commit and stages it again.
+        """
+        share = (self._bytes_max if shared else self._draft_bytes_max) // SHARES
+        staged: Counter[str] = Counter()
+        given_up, freed = [], 0
+        with self._mutex:
+            drafts = [
+                (file, draft.owner, draft.size)
+                for file, draft in self._drafts.items()
+                if draft.shared == shared
+            ]
+            for _, other, size in drafts:
+                staged[other] += size
+            if staged[owner] + total > share:
+                return False
+            for file, other, size in drafts:
+                if freed < total and staged[other] > share:
+                    staged[other] -= size
+                    freed += size
+                    given_up.append(file)
+            for file in given_up:
+                self.drop(file)
+        if not given_up:
+            return False
+        self._count("drafts_displaced", len(given_up))
+        leftovers().wait(ROOM_S)
+        return freed >= total
+
+    def _drafted(self) -> int:
+        """Return the bytes of drafts in plain memory, counting an overhead for small ones."""
+        with self._mutex:
+            plain = [draft.size for draft in self._drafts.values() if not draft.shared]
+        return sum(max(size, PAYLOAD_BYTES_MIN) for size in plain)
+
+    def _refused(self, session: str, total: int, used: int, most: int) -> Refused:
+        self._count("payloads_refused")
+        return Refused(
+            NO_ROOM,
+            f"session {session[:8]} asked for a payload of {total} bytes; {used} of at most {most}"
+            f" are in use{self._biggest()}; raise shared_bytes_max, keep fewer versions, or release"
+            " arrays and locks that still reference old ones",
+        )
+
+    def _in_folder(self, folder: SharedFolder | None, file: str, total: int) -> Pages | None:
+        """Return the memory of a new file whose bytes are counted; None if that fails."""
+        assert folder is not None
+        try:
+            return self._file_memory(folder, file, total)
+        except OSError as error:
+            with self._mutex:
+                self._bytes -= total
+                self._files -= 1
+            self._travels(str(error.strerror or error))
+            return None
+
+    def _travels(self, why: str) -> None:
+        """Count a payload outside the folder, and log it; a full folder is logged less often."""
+        self._count("payload_fallbacks")
+        now_ns = self._clock.monotonic_ns()
+        if self._folder is not None and now_ns >= self._silent_until_ns:
+            self._silent_until_ns = now_ns + SILENT_NS
+            text = "large data go over the network because the shared folder %s takes none: %s"
+            _log.warning(text, self._folder.path, why)
+
+    def _file_memory(self, folder: SharedFolder, file: str, total: int) -> Pages:
+        flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+        name = file
+        if folder.access.group is not None:
+            name = self._names[file] = f"draft-{secrets.token_hex(16)}"
+        made = os.open(name, flags, 0o600, dir_fd=folder.descriptor)
+        try:
+            os.fchmod(made, folder.access.draft_mode)
+            # No holes: a page that is missing later kills the process that touches it.
+            os.posix_fallocate(made, 0, total)
+            return map_file(
+                made, total, writable=True, ended=partial(self._ended, file, folder, total)
+            )
+        except BaseException:
+            os.unlink(name, dir_fd=folder.descriptor)
+            self._names.pop(file, None)
+            raise
+        finally:
+            os.close(made)
+
+    def drop(self, file: str) -> None:
+        """Drop a draft, if it exists."""
+        with self._mutex:
+            self._drafts.pop(file, None)
+            self._over.add(file)
+
+    # ---------------------------------------------------------------- adoption
+
+    def with_bodies(self, message: _Written) -> _Written:
+        """Return a commit or prepare with its named payloads replaced by bodies.
+
+        Missing payloads stay without a body; the shard decides what that means for the lock.
+        """
+        if not names_payloads(message):
+            return message
+        session = message.lock.session
+        return replace(
+            message, writes=tuple([self._adopted_by(w, session) for w in message.writes])
+        )
+
+    def _adopted_by(self, write: WriteItem, session: str) -> WriteItem:
+        datum = write.datum
+        if datum is None or not datum.file or len(datum.body) == datum.size:
+            return write
+        memory = None
+        if datum.file.startswith(f"{session}-"):
+            memory = self._adopt(datum.file, datum.size)
+        if memory is None:
+            self._count("payloads_missing")
+            return write
+        shared = isinstance(memory, Pages)
+        body = body_of(memory).toreadonly()
+        # Plain memory has a name only for its writer.
+        file = datum.file if shared else ""
+        return WriteItem(write.slot, replace(datum, body=body, file=file))
+
+    def _adopt(self, file: str, size: int) -> Pages | Plain | None:
+        """Return the bytes of a complete payload and adopt it; None if there is none."""
+        with self._mutex:
+            known = self._adopted.get(file)
+            if known is not None:
+                memory = known()
+                return memory if memory is not None and memory.size == size else None
+            draft = self._drafts.get(file)
+            if draft is None or draft.size != size or not draft.whole:
+                return None
+            del self._drafts[file]
+            self._adopted[file] = weakref.ref(draft.memory, partial(self._unadopted, file))
+            self._over.add(file)
+        if draft.shared and self._folder is not None:
+            name, descriptor = self._names.get(file, file), self._folder.descriptor
+            try:
+                os.chmod(name, self._folder.access.file_mode, dir_fd=descriptor)
+                if name != file:
+                    os.rename(name, file, src_dir_fd=descriptor, dst_dir_fd=descriptor)
+                    del self._names[file]
+            except OSError as error:  # another program has cleared the folder
+                _log.warning("payload %s is lost: %s", file, error.strerror)
+                return None
+        self._count("payloads_adopted")
+        return draft.memory
+
+    def _ended(self, file: str, folder: SharedFolder | None, counted: int) -> None:
+        """Delete a payload without readers, then stop counting its bytes."""
+        if folder is not None and folder.descriptor >= 0:
+            try:
+                os.unlink(self._names.pop(file, file), dir_fd=folder.descriptor)
+            except OSError as error:  # the folder was deleted first
+                _log.info("payload %s: %s", file, error)
+        with self._mutex:
+            self._bytes -= counted
+            self._files -= folder is not None
+            self._gone += 1
+
+    def _unadopted(self, file: str, gone: weakref.ref[Pages | Plain]) -> None:
+        """Forget an adopted payload; a late draft of the same name then ends silently."""
+        with self._mutex:
+            if self._adopted.get(file) is gone:
+                del self._adopted[file]
+
+    # ---------------------------------------------------------------- life
+
+    def sweep(self, lives: Callable[[str], bool], works: Callable[[str], bool]) -> None:
+        """Drop the drafts that no client will commit any more.
+
+        Args:
+            lives: Whether a session is known.
+            works: Whether a session holds a lock.
+        """
+        if not self._drafts:
+            return
+        late_ns = self._clock.monotonic_ns() - DRAFT_NS
+        with self._mutex:
+            over = [
+                file
+                for file, draft in self._drafts.items()
+                if not lives(draft.session)
+                or (draft.touched_ns < late_ns and not works(draft.session))
+            ]
+            gone = [self._drafts.pop(file) for file in over]
+        if gone:
+            self._count("drafts_swept", len(gone))
+
+    def drafts(self) -> dict[str, str]:
+        """Return the session of each draft, by its name.  For tests and simulation."""
+        with self._mutex:
+            return {file: draft.session for file, draft in self._drafts.items()}
+
+    def figures(self) -> dict[str, int]:
+        """Return counters and current values: files, bytes, drafts."""
+        with self._mutex:
+            return {
+                **self.counters,
+                "payload_files": self._files,
+                "payload_bytes": self._bytes,
+                "payload_bytes_max": self._bytes_max if self._folder is not None else 0,
+                "payload_drafts": len(self._drafts),
+            }
+
+    def _count(self, name: str, count: int = 1) -> None:
+        with self._mutex:
+            self.counters[name] = self.counters.get(name, 0) + count
+
+
+def names_payloads(message: Commit | Prepare) -> bool:
+    """Whether a commit or prepare names data that were staged before it."""
+    for _, datum in message.writes:  # noqa: SIM110 - a generator takes twice as long
+        if datum is not None and datum.file:
+            return True
+    return False
+
+
+def half_of(folder: SharedFolder | None) -> int:
+    """Return half of the folder's file system in bytes; without a folder, the limit of drafts."""
+    if folder is None:
+        return DRAFT_BYTES_MAX
+    system = os.fstatvfs(folder.descriptor)
+    return system.f_blocks * system.f_frsize // 2

@@ -1,0 +1,210 @@
+"""Purges aspects from the folders of a stopped cell: their types and all their data.
+
+::
+
+    all folders locked, opened, checked ─> marked ─> shard by shard: one batch ─> marks removed
+
+Each arrow is durable before the next step, so a later run completes one that was killed anywhere.
+While a folder is marked, no shard starts from it.  If the run is cut off while marks are being set
+or removed, some shards start: with all of their data, or with none of the aspect's.  Each shard's
+data of an aspect go in one batch, so a shard never has a part of them.  Old leases need no waiting:
+a commit under a lock from before the stop is refused, and a shard that starts first waits until
+such leases have ended.
+"""
+
+from __future__ import annotations
+
+from contextlib import ExitStack, contextmanager
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+from enact_dist.core.offline.forgetting import planned, unused_aspects, unused_worlds, world_drops
+from enact_dist.core.protocol.records import Persist
+from enact_dist.errors import MisuseError, StoreError
+from enact_dist.link.folder.marks import mark, under_way, unmark
+from enact_dist.link.store.store import open_store, read_store
+from enact_dist.terms import Durability
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Iterator, Mapping
+    from pathlib import Path
+
+    from enact_dist.core.offline.forgetting import Going, Plan
+    from enact_dist.core.protocol.records import Recovered
+    from enact_dist.link.store.store import Store
+
+
+class Progress(Protocol):
+    """Reports what is purged, and the progress."""
+
+    def found(self, forgotten: Forgotten) -> None:
+        """Take what will be purged; nothing has changed yet, and an exception keeps it so."""
+
+    def act(self, name: str) -> None:
+        """Take the next step; it is durable before the one after."""
+
+
+class _Nobody:
+    """Ignores all reports."""
+
+    def found(self, forgotten: Forgotten) -> None:
+        """Do nothing."""
+
+    def act(self, name: str) -> None:
+        """Do nothing."""
+
+
+class Forgotten(NamedTuple):
+    """What was purged, or would be.
+
+    Attributes:
+        aspects: The aspects, including those of an interrupted earlier run.
+        known: All aspects that these shards have or had.
+        going: Each shard's data of each aspect.
+        resumed: Whether an earlier run was interrupted.  A shard that had already purged an aspect
+            no longer has it; any data there are newer.
+        done: The aspects of the earlier run that every shard had already purged.
+        worlds: The world contexts without data that were dropped, or would be.
+    """
+
+    aspects: tuple[str, ...]
+    known: frozenset[str]
+    going: list[Going]
+    resumed: bool
+    done: tuple[str, ...] = ()
+    worlds: tuple[str, ...] = ()
+
+
+def look(
+    folders: Mapping[str, Path],
+    aspects: Iterable[str],
+    *,
+    unused: Collection[str] | None = None,
+    progress: Progress | None = None,
+) -> Forgotten:
+    """Return what `forget` would purge; change nothing.
+
+    Args:
+        folders: The folder of each shard.
+        aspects: Names of the aspects.
+        unused: As for `forget`.
+        progress: Receives what would be purged.
+
+    Raises:
+        StoreError: As `forget`.
+        MisuseError: As `forget`.
+    """
+    with ExitStack() as open_folders:
+        stored: dict[str, Recovered] = {}
+        for name, folder in folders.items():
+            with _of_shard(name):
+                stored[name] = open_folders.enter_context(read_store(folder))
+        found, _ = _plan(folders, stored, aspects, now_ns=0, unused=unused)
+    (progress or _Nobody()).found(found)
+    _refuse_unknown(found)
+    return found
+
+
+def forget(
+    folders: Mapping[str, Path],
+    aspects: Iterable[str],
+    *,
+    now_ns: int,
+    unused: Collection[str] | None = None,
+    progress: Progress | None = None,
+) -> Forgotten:
+    """Purge aspects, with all data that these shards have of them.
+
+    Args:
+        folders: The folder of each shard.
+        aspects: Names of the aspects.
+        now_ns: The wall clock, nanoseconds since 1970.
+        unused: If given, also purge all aspects and world contexts without data, except these
+            contexts and forks.
+        progress: Receives what is purged, and each step.
+
+    Raises:
+        StoreError: A folder is in use, damaged or not writable, folders of an earlier run are
+            missing, or a commit that names an aspect is undecided; the message says what to do.
+        MisuseError: None of these shards ever knew one of the aspects.
+    """
+    progress = progress or _Nobody()
+    with ExitStack() as undo:
+        stores: dict[str, Store] = {}
+        stored: dict[str, Recovered] = {}
+        for name, folder in folders.items():
+            progress.act(f"open {name}")
+            with _of_shard(name):
+                opened = open_store(folder, unix_s=now_ns // 1_000_000_000, moving=True)
+            stores[name], stored[name] = opened
+            undo.callback(stores[name].close)
+        found, plan = _plan(folders, stored, aspects, now_ns=now_ns, unused=unused)
+        progress.found(found)
+        _refuse_unknown(found)
+        if plan.records:
+            begun = _begun(folders)
+            at_ns = {name: begun.get(name, at_ns) for name, at_ns in plan.at_ns.items()}
+            mark(folders, progress.act, at_ns)
+        for name, records in plan.records.items():
+            progress.act(f"forget on {name}")
+            stores[name].write([Persist(0, records, Durability.DURABLE)])
+            progress.act(f"unlink on {name}")
+            stores[name].rest()
+        unmark(folders, progress.act)
+        for name, dropped in world_drops(stored, found.worlds).items():
+            progress.act(f"drop on {name}")
+            stores[name].write([Persist(0, dropped, Durability.DURABLE)])
+    return found
+
+
+def _plan(
+    folders: Mapping[str, Path],
+    stored: Mapping[str, Recovered],
+    aspects: Iterable[str],
+    *,
+    now_ns: int,
+    unused: Collection[str] | None,
+) -> tuple[Forgotten, Plan]:
+    """Return the plan; aspects of an interrupted run are purged as well.
+
+    Raises:
+        StoreError: There is an obstacle.
+    """
+    begun = _begun(folders)
+    worlds: tuple[str, ...] = ()
+    if unused is not None:
+        aspects = dict.fromkeys((*aspects, *unused_aspects(stored)))
+        worlds = unused_worlds(stored, unused)
+    plan = planned(stored, aspects, now_ns=now_ns, begun=begun)
+    if plan.obstacles:
+        more = f"; and {len(plan.obstacles) - 3} more" if len(plan.obstacles) > 3 else ""
+        raise StoreError(f"nothing was forgotten: {'; '.join(plan.obstacles[:3])}{more}")
+    known = plan.known | begun.keys()  # a restore may have removed all traces of the run
+    return Forgotten(plan.names, known, plan.going, bool(begun), plan.done, worlds), plan
+
+
+def _begun(folders: Mapping[str, Path]) -> dict[str, int]:
+    """Return the aspects of an interrupted run, each with the timestamp from which on to purge.
+
+    Raises:
+        StoreError: As `under_way`.
+    """
+    marks = under_way(folders, forgets=True)
+    return {name: at_ns for each in marks.values() for name, at_ns in each.aspects.items()}
+
+
+def _refuse_unknown(found: Forgotten) -> None:
+    unknown = [name for name in found.aspects if name not in found.known]
+    if unknown:
+        raise MisuseError(
+            f"no shard here has an aspect {', '.join(unknown)} (known:"
+            f" {', '.join(sorted(found.known)) or 'none'}); nothing was forgotten"
+        )
+
+
+@contextmanager
+def _of_shard(name: str) -> Iterator[None]:
+    """Add the shard's name to errors about its folder."""
+    try:
+        yield
+    except StoreError as error:
+        raise StoreError(f"shard {name}: {error}", path=error.path) from error

@@ -1,0 +1,196 @@
+"""Moves entities between the folders of a stopped cell according to its placement.
+
+::
+
+    all folders locked, opened, checked ─> marked ─> epochs raised ─> shared records copied
+      ─> batch by batch: the new shard has it durably ─> the old one forgets it ─> marks removed
+
+Each arrow is durable before the next step, so a later run completes one that was killed anywhere.
+While a folder is marked, no shard starts from it.  Rules that a change must keep:
+
+- Before anything moves, all epochs rise above the highest one: an entity's fencing numbers then
+  grow on its new shard too, and no client confuses old and new versions.
+- A client that was disconnected while holding a lock may believe in it for a TTL.  So the marks
+  stay until all folders have been locked for the longest TTL of the sessions that had not ended.
+"""
+
+from __future__ import annotations
+
+import time
+from contextlib import ExitStack
+from itertools import groupby
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
+
+from enact_dist.core.offline.moving import Move, Shards
+from enact_dist.core.protocol.records import Persist
+from enact_dist.errors import StoreError
+from enact_dist.link.folder.marks import mark, under_way, unmark
+from enact_dist.link.store.store import open_store, read_store
+from enact_dist.terms import Durability
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+    from pathlib import Path
+
+    from enact_dist.core.protocol.messages import PlacementMap
+    from enact_dist.core.protocol.records import Record, Recovered
+    from enact_dist.link.store.store import Store
+
+BATCH_BYTES: Final = 32 << 20
+"""About so many bytes move at once; a larger entity moves alone."""
+BATCH_STATES: Final = 2_000
+
+
+class Progress(Protocol):
+    """Reports the progress of a rebalance."""
+
+    def act(self, name: str) -> None:
+        """Take the next step; it is durable before the one after."""
+
+    def moved(self, entities: int, size: int) -> None:
+        """Take the number of entities and bytes that are in their final place."""
+
+    def waits(self, wait_s: float) -> None:
+        """Take the remaining wait for leases from before the stop."""
+
+
+class _Nobody:
+    """Ignores all reports."""
+
+    def act(self, name: str) -> None:
+        """Do nothing."""
+
+    def moved(self, entities: int, size: int) -> None:
+        """Do nothing."""
+
+    def waits(self, wait_s: float) -> None:
+        """Do nothing."""
+
+
+class Rebalance(NamedTuple):
+    """What was done, or would be.
+
+    Attributes:
+        moves: The entities that move, in order.
+        resumed: Whether an earlier run was interrupted.
+        waited_s: Time spent waiting for leases from before the stop.
+    """
+
+    moves: list[Move]
+    resumed: bool
+    waited_s: float = 0.0
+
+
+def look(folders: Mapping[str, Path], placement: PlacementMap) -> Rebalance:
+    """Return what `rebalance` would do, without changing anything.
+
+    Raises:
+        StoreError: As `rebalance`.
+    """
+    with ExitStack() as open_folders:
+        stored = {
+            name: open_folders.enter_context(read_store(folder)) for name, folder in folders.items()
+        }
+        resumed = bool(under_way(folders))
+        plan = Shards(stored, placement, under_way=resumed).plan()
+    _refuse(plan.obstacles)
+    return Rebalance(plan.moves, resumed)
+
+
+def rebalance(
+    folders: Mapping[str, Path],
+    placement: PlacementMap,
+    *,
+    unix_s: int,
+    progress: Progress | None = None,
+) -> Rebalance:
+    """Move every entity to its shard under `placement`.
+
+    Args:
+        folders: The folder of each shard: all of the placement, and those that leave the cell.
+        placement: The new placement of entities.
+        unix_s: The wall clock, seconds since 1970.
+        progress: Receives the progress.
+
+    Raises:
+        StoreError: A folder is in use, damaged or cannot be written, folders of an earlier run are
+            missing, or something would be lost; the message says what to do.
+    """
+    progress = progress or _Nobody()
+    with ExitStack() as undo:
+        stores: dict[str, Store] = {}
+        stored: dict[str, Recovered] = {}
+        for name, folder in folders.items():
+            progress.act(f"open {name}")
+            stores[name], stored[name] = open_store(folder, unix_s=unix_s, moving=True)
+            undo.callback(stores[name].close)
+        locked_s = time.monotonic()
+        resumed = bool(under_way(folders))
+        shards = Shards(stored, placement, under_way=resumed)
+        plan = shards.plan()
+        _refuse(plan.obstacles)
+        if plan.moves or plan.first or resumed:
+            mark(folders, progress.act)
+        if plan.moves or plan.first:
+            epoch = max(found.epoch for found in stored.values())
+            for name, store in stores.items():
+                progress.act(f"raise the epoch of {name}")
+                store.raise_epoch(epoch)
+            for name, records in plan.first.items():
+                progress.act(f"tell {name}")
+                _write(stores[name], records)
+            _move(shards, plan.moves, stores, progress)
+        wait_s = 0.0
+        if plan.moves or resumed:
+            ttl_ns = max((s.ttl_ns for found in stored.values() for s in found.sessions), default=0)
+            wait_s = max(0.0, locked_s + ttl_ns / 1e9 - time.monotonic())
+            progress.waits(wait_s)
+            time.sleep(wait_s)
+        unmark(folders, progress.act)
+    return Rebalance(plan.moves, resumed, wait_s)
+
+
+def _move(
+    shards: Shards,
+    moves: Iterable[Move],
+    stores: Mapping[str, Store],
+    progress: Progress,
+) -> None:
+    count = size = 0
+    for batch in _batches(moves):
+        source, target, entities = batch[0].source, batch[0].target, [m.entity for m in batch]
+        if not batch[0].copied:
+            progress.act(f"copy {entities[0]} to {target}")
+            _write(stores[target], shards.brought(target, entities, source))
+        progress.act(f"forget {entities[0]} on {source}")
+        _write(stores[source], shards.left(source, tuple(entities)))
+        progress.act(f"unlink on {source}")
+        stores[source].rest()
+        stores[target].rest()
+        count, size = count + len(batch), size + sum(move.size for move in batch)
+        progress.moved(count, size)
+
+
+def _batches(moves: Iterable[Move]) -> Iterator[list[Move]]:
+    """Yield batches of moves, with entities that are already copied last."""
+    ordered = sorted(moves, key=lambda move: (move.copied, move.source, move.target))
+    for _, group in groupby(ordered, key=lambda move: (move.copied, move.source, move.target)):
+        batch: list[Move] = []
+        states = size = 0
+        for move in group:
+            states, size = states + move.states, size + move.size
+            if batch and (size > BATCH_BYTES or states > BATCH_STATES):
+                yield batch
+                batch, states, size = [], move.states, move.size
+            batch.append(move)
+        yield batch
+
+
+def _write(store: Store, records: tuple[Record, ...]) -> None:
+    store.write([Persist(0, records, Durability.DURABLE)])
+
+
+def _refuse(obstacles: list[str]) -> None:
+    if obstacles:
+        more = f"; and {len(obstacles) - 3} more" if len(obstacles) > 3 else ""
+        raise StoreError(f"nothing was moved: {'; '.join(obstacles[:3])}{more}")

@@ -1,0 +1,157 @@
+"""A connection that receives notices; they are queued while the watcher does not read.
+
+The queue holds up to `NOTICES_MAX` notices; further ones are dropped and counted, and the watcher
+sees the gap in their numbers.
+
+Notices that it does not watch are not sent, since each would wake a process for nothing.  It gets
+only their numbers, before the next notice or once they are `SKIP_S` old.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import socket
+import threading
+import time
+from collections import deque
+from typing import TYPE_CHECKING, Final, Protocol
+
+from enact_dist.link.notices import Skipped
+from enact_dist.link.socket.frames import Kind, prefixed, skipped_frame
+
+if TYPE_CHECKING:
+    from enact_dist.core.protocol.messages import Notice
+    from enact_dist.link.host import ShardHost
+    from enact_dist.link.notices import Interest
+
+NOTICES_MAX: Final = 65_536
+"""Notices queued for a watcher that does not read."""
+SKIP_S: Final = 0.25
+"""After this time the numbers of skipped notices are sent on their own."""
+
+
+class Publisher(Protocol):
+    """What a watcher needs of the service that sends it notices."""
+
+    @property
+    def host(self) -> ShardHost:
+        """The shard, which counts what is dropped."""
+
+    def watch(self, watcher: SocketWatcher) -> None:
+        """Send all further notices to `watcher`."""
+
+    def unwatch(self, watcher: SocketWatcher) -> None:
+        """Stop sending notices to `watcher`."""
+
+
+class SocketWatcher:
+    """One watching connection; its own thread calls `run`, publishing threads call `put`."""
+
+    __slots__ = (
+        "_bell", "_connected", "_interest", "_mutex", "_service", "_skipped", "_skipped_s",
+        "_waiting",
+    )  # fmt: skip
+
+    def __init__(
+        self, service: Publisher, connected: socket.socket, interest: Interest | None
+    ) -> None:
+        self._service = service
+        self._interest = interest
+        self._skipped: Skipped | None = None
+        self._skipped_s = 0.0
+        self._connected = connected
+        self._mutex = threading.Lock()
+        # The first frame sent, even if a commit is published at this moment.
+        self._waiting = deque([memoryview(prefixed(b"", 0, Kind.OPENED))])
+        self._bell = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+
+    def put(self, notice: Notice, frame: bytes) -> None:
+        """Send the frame of a notice, if it is watched; by one thread at a time."""
+        kept = True
+        with self._mutex:
+            if self._interest is None or self._interest.covers(notice):
+                kept = self._send(self._taken_skipped() + frame)
+            elif self._skipped is None:
+                number = notice.number
+                self._skipped = Skipped(notice.shard, notice.epoch, number - 1, number)
+                self._skipped_s = time.monotonic()
+            else:
+                shard, epoch, after, _ = self._skipped
+                self._skipped = Skipped(shard, epoch, after, notice.number)
+        self._count(kept=kept)
+
+    def tell_skipped(self) -> None:
+        """Send the numbers of notices skipped a while ago."""
+        if self._skipped is None or time.monotonic() - self._skipped_s < SKIP_S:
+            return
+        with self._mutex:
+            kept = self._send(self._taken_skipped())
+        self._count(kept=kept)
+
+    def _count(self, *, kept: bool) -> None:
+        """Count dropped notices; without the mutex, which others take inside the host's."""
+        if not kept:
+            self._service.host.count("notices_dropped")
+
+    def _taken_skipped(self) -> bytes:
+        skipped, self._skipped = self._skipped, None
+        return skipped_frame(*skipped[1:]) if skipped is not None else b""
+
+    def _send(self, frame: bytes) -> bool:
+        """Send a frame, as far as possible without blocking, or queue it; False: dropped."""
+        if self._bell < 0:
+            return True
+        if self._waiting:
+            if len(self._waiting) >= NOTICES_MAX:
+                return False
+            self._waiting.append(memoryview(frame))
+            return True
+        try:
+            sent = self._connected.send(frame, socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            sent = 0
+        except OSError:  # its own thread notices this, too
+            return True
+        if sent < len(frame):
+            # Before the bell, which makes the thread look for frames to send and then wait.
+            self._waiting.append(memoryview(frame)[sent:])
+            os.eventfd_write(self._bell, 1)
+        return True
+
+    def run(self) -> None:
+        """Send the queued frames, until the connection ends."""
+        poll = select.poll()
+        poll.register(self._bell, select.POLLIN)
+        poll.register(self._connected, select.POLLIN)
+        self._service.watch(self)
+        try:
+            while True:
+                poll.modify(
+                    self._connected, select.POLLIN | (select.POLLOUT if self._waiting else 0)
+                )
+                for descriptor, event in poll.poll():
+                    if descriptor == self._bell:
+                        os.eventfd_read(self._bell)
+                    elif event & ~select.POLLOUT:
+                        return  # a watcher sends nothing: it has ended
+                    else:
+                        self._flush()
+        finally:
+            self._service.unwatch(self)
+            with self._mutex:
+                os.close(self._bell)
+                self._bell = -1
+
+    def _flush(self) -> None:
+        while self._waiting:
+            first = self._waiting[0]
+            try:
+                sent = self._connected.send(first, socket.MSG_DONTWAIT)
+            except BlockingIOError:
+                return
+            with self._mutex:
+                if sent < len(first):
+                    self._waiting[0] = first[sent:]
+                else:
+                    self._waiting.popleft()

@@ -1,0 +1,1 @@
+"""The store of a shard in SQLite: batches, rows, and recovery after a fault."""

@@ -1,0 +1,1 @@
+"""Operate a cell: supervise its processes, and diagnose what is wrong with them."""

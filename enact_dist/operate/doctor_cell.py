@@ -1,0 +1,218 @@
+"""Compares a `cell.toml` with the cell that runs: what the shards say of themselves.
+
+Clients go by what the shards say, so they work with an old file, too; a shard that is started with
+another file than the rest does not.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.core.state.clock import is_kept
+from enact_dist.operate.doctor import Finding, Level
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Iterator, Mapping
+    from pathlib import Path
+
+    from enact_dist.config.types import CellConfig, ShardConfig
+    from enact_dist.core.protocol.answers import Welcome
+    from enact_dist.core.protocol.parts import PlacementMap
+    from enact_dist.world.listings import ShardInfo
+
+ASK_S: Final = 0.5
+"""How long each place at which a shard is expected may take to say which daemon serves it."""
+DISK_BYTES_WARN: Final = 1_000_000_000
+DISK_BYTES_FAIL: Final = 50_000_000
+
+_RESTART = (
+    "take the file that the shards were started with; or stop them all, move entities with"
+    " enact shard rebalance, and start all with this one"
+)
+
+
+def differences(
+    config: CellConfig | None, shards: Iterable[ShardInfo], welcomes: Mapping[str, Welcome]
+) -> Iterator[Finding]:
+    """Name what the running shards say otherwise than each other, or than the file.
+
+    Args:
+        config: The file; None: there is none.
+        shards: The shards of the running cell.
+        welcomes: The answers about the cell.
+    """
+    placements = {name: welcome.placement for name, welcome in welcomes.items()}
+    versions = {placement.version: name for name, placement in placements.items()}
+    if len(versions) > 1:
+        first, other = list(versions.values())[:2]
+        yield Finding(
+            Level.FAIL,
+            "placement",
+            f"{first} and {other} were started with different shards or pins: {_shown(placements)}",
+            "start all shards with the same cell.toml",
+        )
+    elif config is not None:
+        for placement in list(placements.values())[:1]:
+            yield from _placement(config, placement)
+    if config is None:
+        return
+    running = {shard.name: shard for shard in shards if shard.reachable}
+    for shard in config.shards:
+        if shard.name in running:
+            yield from _folder(shard, kept=is_kept(running[shard.name].epoch))
+    yield from _catalogue(config, welcomes)
+
+
+def namesakes(
+    cell: str, config: CellConfig | None, welcomes: Mapping[str, Welcome]
+) -> Iterator[Finding]:
+    """Name the shards that several daemons serve, at any endpoint known of them.
+
+    Args:
+        cell: The cell's name.
+        config: The file; None where there is none.
+        welcomes: The answers about the cell.
+
+    Each shard is asked, too, at which further places others have named it.
+    """
+    from enact_dist.link.client.namesakes import serving, told_places, two_daemons
+
+    entries = [entry for welcome in welcomes.values() for entry in welcome.placement.shards]
+    if config is not None:
+        entries += config.placement_map().shards
+    for told in told_places(cell, list(dict.fromkeys(entries)), timeout_s=ASK_S):
+        entries += told
+    places: dict[str, dict[str, None]] = {}
+    for entry in entries:
+        places.setdefault(entry.name, {}).update(dict.fromkeys(entry.endpoints))
+    for shard, endpoints in places.items():
+        found = serving(cell, shard, endpoints, timeout_s=ASK_S) if len(endpoints) > 1 else ()
+        if len(found) > 1:
+            wrong, _, remedy = two_daemons(cell, shard, found).partition("; ")
+            yield Finding(Level.FAIL, f"shard {shard}", wrong, remedy)
+
+
+def folders(config: CellConfig, kept: Collection[str]) -> Iterator[Finding]:
+    """Check the disks of the shards that run, or may run, on this host.
+
+    Args:
+        config: The file.
+        kept: The shards that run and keep data in a folder, wherever that is.
+    """
+    host = socket.gethostname()
+    for shard in config.shards:
+        folder, running = shard.folder, shard.name in kept
+        if folder is None:
+            if not running:
+                yield _without_folder(shard.name)
+        elif running and not os.access(folder, os.W_OK | os.X_OK):
+            text = f"{folder} is on another machine or another user's, where the shard runs"
+            yield Finding(Level.OK, f"disk of {shard.name}", text)
+        elif shard.host in {"", host}:
+            yield data_folder(shard.name, folder)
+
+
+def _without_folder(shard: str) -> Finding:
+    return Finding(
+        Level.WARN,
+        f"disk of {shard}",
+        "no folder: everything is lost when the shard stops",
+        f"write data_folder, or a folder in [shards.{shard}]",
+    )
+
+
+def data_folder(shard: str, folder: Path) -> Finding:
+    """Check the disk on which a shard keeps, or will keep, its data."""
+    subject = f"disk of {shard}"
+    there = folder
+    while not there.exists() and there != there.parent:
+        there = there.parent
+    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+        user = os.environ.get("USER", str(os.getuid()))
+        return Finding(
+            Level.FAIL,
+            subject,
+            f"{there} cannot be written by {user}",
+            f"if shard {shard} is to run here, as {user}: sudo install -d -o {user} {folder}",
+        )
+    free = shutil.disk_usage(there).free
+    text = f"{folder}: {free / 1e9:.1f} GB free"
+    if free < DISK_BYTES_FAIL:
+        return Finding(Level.FAIL, subject, text, "free some space: a full disk stops the shard")
+    if free < DISK_BYTES_WARN:
+        return Finding(Level.WARN, subject, text, "free some space: a full disk stops the shard")
+    return Finding(Level.OK, subject, text)
+
+
+def _placement(config: CellConfig, running: PlacementMap) -> Iterator[Finding]:
+    """Compare which shards there are, and where entities live."""
+    ours = config.placement_map()
+    if running.version == ours.version:
+        return
+    names = sorted(shard.name for shard in running.shards)
+    wanted = sorted(shard.name for shard in ours.shards)
+    if names != wanted:
+        text = f"shards {', '.join(wanted)}; the running cell has {', '.join(names)}"
+    else:
+        text = f"{_pins(ours)}; the running cell has {_pins(running)}"
+    yield Finding(Level.WARN, "cell.toml and cell", f"the file has {text}", _RESTART)
+
+
+def _folder(shard: ShardConfig, *, kept: bool) -> Iterator[Finding]:
+    """Compare whether a shard keeps what is committed."""
+    subject = f"disk of {shard.name}"
+    if shard.folder is None and kept:
+        yield Finding(
+            Level.WARN,
+            subject,
+            "the running shard keeps its data in a folder, this file names none: started with it,"
+            " the shard would begin empty",
+            f"write the folder into [shards.{shard.name}], or data_folder for all",
+        )
+    elif shard.folder is not None and not kept:
+        yield Finding(
+            Level.WARN,
+            subject,
+            f"the running shard has no folder, though this file names {shard.folder}: everything"
+            " is lost when it stops",
+            "save what is needed (enact world export), and start the shard with this file",
+        )
+
+
+def _catalogue(config: CellConfig, welcomes: Mapping[str, Welcome]) -> Iterator[Finding]:
+    """Compare world contexts and what commits survive."""
+    for name, welcome in welcomes.items():
+        lacking = [world for world in config.worlds if world not in welcome.worlds]
+        if lacking:
+            yield Finding(
+                Level.WARN,
+                f"cell.toml and {name}",
+                f"the shard has no world context {', '.join(lacking)} of this file",
+                "restart it with this file, or: "
+                + "; ".join(f"enact world create {world}" for world in lacking),
+            )
+        known = {entry.name: entry.durability for entry in welcome.aspects}
+        for aspect in config.aspects:
+            asked = aspect.durability.value if aspect.durability is not None else ""
+            if asked and known.get(aspect.name, asked) != asked:
+                yield Finding(
+                    Level.WARN,
+                    f"cell.toml and {name}",
+                    f"aspect {aspect.name} is {known[aspect.name]} there and {asked} in this file",
+                    "start all shards with the same cell.toml",
+                )
+
+
+def _shown(placements: Mapping[str, PlacementMap]) -> str:
+    return "; ".join(
+        f"{name} has shards {', '.join(sorted(shard.name for shard in placement.shards))}"
+        f" and {_pins(placement)}"
+        for name, placement in placements.items()
+    )
+
+
+def _pins(placement: PlacementMap) -> str:
+    return ", ".join(f"{pin.pattern} pinned to {pin.shard}" for pin in placement.pins) or "no pins"

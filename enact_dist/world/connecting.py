@@ -1,0 +1,209 @@
+"""How a process comes to a cell: `connect` over the network, `local` inside this process."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import socket
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from enact_dist.access.arguments import check_seconds
+from enact_dist.core.client.client import Client
+from enact_dist.core.protocol.messages import PlacementMap, ShardEntry, Welcome
+from enact_dist.errors import ConfigError, LinkError, MisuseError
+from enact_dist.link.zenoh.endpoints import PROTOCOLS, split_endpoint
+from enact_dist.terms import checked_name
+from enact_dist.wire.limits import NAME_CHARACTERS_MAX
+from enact_dist.wire.texts import is_safe, shown
+from enact_dist.world.cell import Cell
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from enact_dist.config.read import CellConfig
+    from enact_dist.link.clock import Clock
+
+TTL_S: Final = 2.0
+"""Lease of a session that no `cell.toml` says otherwise about."""
+LOCAL_SHARD: Final = "local"
+
+
+def connect(
+    target: str | Path,
+    *,
+    actor: str = "",
+    timeout_s: float = 5.0,
+    patience_s: float = 10.0,
+    observer: bool = False,
+) -> Cell:
+    """Join a running cell.
+
+    Args:
+        target: A `cell.toml`, or one endpoint such as ``tcp/host:7447``; one is enough, as each
+            shard knows the others.
+        actor: Name under which `enact lock ls` and `enact actor ls` show this process.
+        timeout_s: How long to wait for a first shard to answer.
+        patience_s: How long a question waits for a shard that does not answer, before it counts as
+            unreachable; locks bring a time of their own, and a commit takes as long as it takes to
+            know its end.
+        observer: Only look: no lock can be taken, no world context or aspect comes to be, and a
+            shard keeps no record of the session.
+
+    Raises:
+        ShardUnreachableError: No shard answered in time; the message names shards and endpoints.
+        ConfigError: The `cell.toml` cannot be used, or `target` is neither file nor endpoint.
+        MisuseError: A time is negative or not a number, or this process was forked from one that
+            has been connected (see `Cell`).
+    """
+    from enact_dist.config.environment import carrier_of
+    from enact_dist.link.client.joining import join
+    from enact_dist.link.zenoh.config import OPEN_S
+
+    for word, waits_s in (("timeout_s", timeout_s), ("patience_s", patience_s)):
+        check_seconds(word, waits_s)
+    name, ttl_s = "", TTL_S
+    carrier = carrier_of(os.environ)
+    endpoints: tuple[str, ...] = (str(target),)
+    expected: tuple[ShardEntry, ...] = ()
+    if not _is_endpoint(target):
+        from enact_dist.config.read import load_config
+
+        _refuse_no_file(target)
+        config = load_config(Path(target))
+        name, ttl_s, carrier = config.name, config.ttl_s, config.carrier
+        expected = config.placement_map().shards
+        endpoints = tuple(e for entry in expected for e in entry.endpoints)
+    client = _client(actor, ttl_s=ttl_s, observer=observer)
+    cell_name, cell_client, welcome = join(
+        name,
+        endpoints,
+        client,
+        timeout_s=timeout_s,
+        open_s=min(OPEN_S, patience_s),
+        carrier=carrier,
+        expected=expected,
+    )
+    cell_client.patience_s = patience_s
+    try:
+        cell_client.start(welcome)
+    except BaseException:
+        cell_client.close()
+        raise
+    return Cell(cell_name, cell_client)
+
+
+def local(
+    path: str | Path | None = None,
+    *,
+    worlds: Sequence[str] = (),
+    config: CellConfig | None = None,
+    actor: str = "",
+    clock: Clock | None = None,
+) -> Cell:
+    """Run one shard inside this process: the paper's mode, several actors as threads.
+
+    Args:
+        path: Folder that keeps what is committed; None keeps it in memory, and every aspect is
+            volatile then whatever it asks for.
+        worlds: World contexts to make.
+        config: Aspects, further world contexts and the session's TTL of a `cell.toml`.
+        actor: Name under which this process is shown.
+        clock: Times of the shard, for tests; the default is this host's.
+
+    Raises:
+        StoreError: The folder is in use, unreadable or corrupt.
+        MisuseError: `worlds` holds no names of world contexts.
+    """
+    from enact_dist.core.shard.state import ShardSettings
+    from enact_dist.link.client.locks import CellClient
+    from enact_dist.link.daemon.embedded import EmbeddedCarrier
+    from enact_dist.link.host import open_host
+
+    names = dict.fromkeys((*_world_names(worlds), *(config.worlds if config else ())))
+    settings = ShardSettings(
+        LOCAL_SHARD,
+        PlacementMap(1, (ShardEntry(LOCAL_SHARD, ()),), ()),
+        tuple(names),
+        config.aspect_entries() if config else (),
+        fetch_bytes_max=1 << 40,
+    )
+    host = open_host(settings, Path(path) if path is not None else None, clock=clock)
+    try:
+        client = _client(actor, ttl_s=config.ttl_s if config else TTL_S, observer=False)
+        carrier = EmbeddedCarrier(host, client.session)
+        options: dict[str, Any] = {} if clock is None else {"now_ns": clock.monotonic_ns}
+        cell_client = CellClient(carrier, client, keep_alive=False, **options)
+        welcome = cell_client.call(LOCAL_SHARD, client.hello(LOCAL_SHARD))
+        if not isinstance(welcome, Welcome):
+            raise LinkError(f"{type(welcome).__name__} came as the answer to Hello")
+        cell_client.start(welcome)
+    except BaseException:
+        host.close()
+        raise
+    return Cell(config.name if config else LOCAL_SHARD, cell_client, host=host)
+
+
+def _world_names(worlds: Sequence[str]) -> tuple[str, ...]:
+    if isinstance(worlds, str):
+        raise MisuseError(f"worlds={worlds!r} is one string; write worlds=[{worlds!r}]")
+    try:
+        return tuple(checked_name("world context", name, slashes=False) for name in worlds)
+    except ValueError as error:
+        raise MisuseError(str(error)) from None
+
+
+def _is_endpoint(target: str | Path) -> bool:
+    """Say whether `target` is written as an endpoint, with a port that there can be.
+
+    Raises:
+        ConfigError: It is an endpoint with an invalid port.
+    """
+    if isinstance(target, Path):
+        return False
+    protocol, host, port = split_endpoint(target)
+    if "/" not in target or protocol not in PROTOCOLS:
+        return False
+    if protocol == "unixsock-stream":
+        return True
+    if not host or not port.isdecimal() or not 0 < int(port) < 1 << 16:
+        raise ConfigError(f"endpoint {target!r} lacks a host or a port; {_ENDPOINT}")
+    return True
+
+
+def _refuse_no_file(target: str | Path) -> None:
+    if not str(target) or not Path(target).exists():
+        raise ConfigError(
+            f"{str(target)!r} is neither a file nor an endpoint; {_ENDPOINT}, a cell is described"
+            " in a cell.toml",
+            path=str(target),
+        )
+
+
+_ENDPOINT: Final = "an endpoint looks like 'tcp/host:7447'"
+
+
+def _checked_actor(actor: str) -> str:
+    """Return a name that is safe in logs and tables of others.
+
+    Raises:
+        ConfigError: It has a character that could not, or is too long.
+    """
+    if is_safe(actor) and len(actor) <= NAME_CHARACTERS_MAX:
+        return actor
+    raise ConfigError(
+        f"an actor cannot be called {shown(actor[:60])!r}: a name has at most"
+        f" {NAME_CHARACTERS_MAX} characters, and no line breaks or other control characters"
+    )
+
+
+def _client(actor: str, *, ttl_s: float, observer: bool) -> Client:
+    return Client(
+        secrets.token_hex(16),
+        ttl_ns=int(ttl_s * 1e9),
+        actor=_checked_actor(actor) or shown(Path(sys.argv[0] or "python").stem) or "python",
+        host=socket.gethostname(),
+        pid=os.getpid(),
+        observer=observer,
+    )

@@ -1,0 +1,379 @@
+"""Where a datum comes from and what came of it: trees of commits, as far as they are remembered.
+
+Each version knows the commit that made it and the versions that its lock had read
+(`access.writes`). Followed back these are its causes (`Cell.why`), followed on its effects
+(`Cell.impact`), over all shards and world contexts.  A cause is remembered as long as the version
+that it made: versions beyond retention appear in a tree of causes as "forgotten", by name;
+forgotten effects cannot be found.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+from enact_dist.access.asking import versions_in
+from enact_dist.core.protocol.datum import LockId, Position, Slot
+from enact_dist.core.protocol.messages import (
+    Cause,
+    DatumRead,
+    Explain,
+    FindEffects,
+    ListHistory,
+    SlotVersion,
+)
+from enact_dist.errors import ForgottenError, MisuseError, NullDatumError
+from enact_dist.terms import Entity, NullReason, checked_name
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+
+    from enact_dist.access.session import Session
+    from enact_dist.core.protocol.messages import Request, SlotState, VersionEntry
+    from enact_dist.link.client.locks import CellClient
+    from enact_dist.terms import Aspect, Context
+
+    Named = tuple[Context | str, Entity | str, Aspect[Any] | str]
+    """World context, entity and aspect of a datum, or their names."""
+
+FORGOTTEN: Final = "forgotten"
+UNKNOWN: Final = "unknown"
+NULL: Final = "null"
+
+DEPTH_MAX: Final = 200
+"""Most steps of one tree: a recursive walk stays within Python's recursion limit."""
+ASKED_MAX: Final = 256
+"""So many data are asked about by one question; each may name a thousand others."""
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class Made:
+    """One version of a datum, and who made it.
+
+    Attributes:
+        world: Name of its world context.
+        entity: Its entity.
+        aspect: Name of its aspect.
+        version: Its number.
+        position: Position of its commit.
+        age_s: How long ago that was, by the shards' clock.
+        kind: "commit" or "fork"; else why no more is known of it: "forgotten" (it has left its
+            retention), "unknown" (it is there without its cause) or "null" (it was read where
+            there was no datum yet, or none any more after its volatile shard had restarted).
+        actor: Who committed it; the empty string if it has no name.
+        host: Host of that client.
+        pid: Process of that client.
+        stamp_ns: When the datum was captured, according to the actor (0: unknown).
+        held_s: How long the lock had been held when it committed.
+        null_reason: Why the version is null; the empty string for a datum.
+        left_out: How many further data its lock had read than a commit names.
+        elsewhere: Whether it stands in the tree a second time, nearer to the root or before; what
+            follows it is shown there.
+        unfollowed: How many versions come next that were not followed, because of the depth.
+    """
+
+    world: str
+    entity: Entity
+    aspect: str
+    version: int
+    position: Position
+    age_s: float
+    kind: str
+    actor: str = ""
+    host: str = ""
+    pid: int = 0
+    stamp_ns: int = 0
+    held_s: float = 0.0
+    null_reason: str = ""
+    left_out: int = 0
+    elsewhere: bool = False
+    unfollowed: int = 0
+
+    @property
+    def known(self) -> bool:
+        """Whether the version is still there, so that it can be kept."""
+        return self.kind not in {FORGOTTEN, NULL}
+
+    @property
+    def slot(self) -> Slot:
+        """What it is a version of."""
+        return Slot(self.world, self.entity.name, self.aspect)
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} of {self.slot} v{self.version}>"
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class CauseTree(Made):
+    """A version with those that its lock had read when it was committed, and their causes.
+
+    Attributes:
+        children: What it was made of, by name.
+    """
+
+    children: tuple[CauseTree, ...] = ()
+
+    def walk(self) -> Iterator[CauseTree]:
+        """Yield this version and all that led to it, each once."""
+        return _walk(self)
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class EffectTree(Made):
+    """A version with those whose locks had read it when they were committed, and their effects.
+
+    Attributes:
+        children: What it went into, the oldest first.
+    """
+
+    children: tuple[EffectTree, ...] = ()
+
+    def walk(self) -> Iterator[EffectTree]:
+        """Yield this version and all that came of it, each once."""
+        return _walk(self)
+
+
+Tree = TypeVar("Tree", CauseTree, EffectTree)
+Part = TypeVar("Part")
+_NOBODY: Final = Cause(LockId("", 0, 0), "", "", "", 0, 0, 0, (), 0, ())
+
+
+def _walk(tree: Tree) -> Iterator[Tree]:
+    yield tree
+    for child in tree.children:
+        if not child.elsewhere:
+            yield from _walk(child)
+
+
+def causes_of(session: Session, named: Named, version: int, depth: int | None) -> CauseTree:
+    """Return where a version comes from; see `Cell.why`."""
+    search = _Search(session.client)
+    start = search.start(_slot_of(session, *named), version)
+    return _grown(CauseTree, search, start, search.causes, depth)
+
+
+def effects_of(session: Session, named: Named, version: int, depth: int | None) -> EffectTree:
+    """Return what came of a version; see `Cell.impact`."""
+    search = _Search(session.client)
+    start = search.start(_slot_of(session, *named), version)
+    return _grown(EffectTree, search, start, search.effects, depth)
+
+
+def _slot_of(
+    session: Session, world: Context | str, entity: Entity | str, aspect: Aspect[Any] | str
+) -> Slot:
+    """Return the slot that is named; its world context is there."""
+    session.client.check_usable()
+    name = world if isinstance(world, str) else world.name
+    if not isinstance(world, str) and getattr(world, "session", None) is not session:
+        raise MisuseError(f"{world!r} is not a world context of this cell through this connection")
+    if not isinstance(world, str) and world.past:
+        raise MisuseError(f"{world!r} is as it was; name {name!r} and a version of its history")
+    if name not in session.client.worlds():
+        session.check_world(name)
+    try:
+        return Slot(
+            name, Entity(str(entity)).name, checked_name("aspect", str(aspect), slashes=False)
+        )
+    except ValueError as error:
+        raise MisuseError(str(error)) from None
+
+
+def _grown(
+    kind: type[Tree],
+    search: _Search,
+    root: DatumRead,
+    follow: Callable[[Sequence[DatumRead]], Mapping[DatumRead, Sequence[DatumRead]]],
+    depth: int | None,
+) -> Tree:
+    """Return the tree from `root` on, each version in full where it is nearest to it.
+
+    Args:
+        kind: Which tree.
+        search: Says what is known of a version.
+        root: Where it begins.
+        follow: Returns what comes next of each of some versions, with one question to each shard.
+        depth: How many steps to follow; None: `DEPTH_MAX`.
+    """
+    if depth is not None and not 0 <= depth <= DEPTH_MAX:
+        raise MisuseError(f"depth is {depth!r}; it must lie in 0 to {DEPTH_MAX} steps")
+    depth = DEPTH_MAX if depth is None else depth
+    steps, parents = {root: 0}, dict[DatumRead, DatumRead]()
+    follows: dict[DatumRead, Sequence[DatumRead]] = {}
+    level = [root]
+    while level:
+        follows.update(follow(level))
+        step = steps[level[0]] + 1
+        pairs = [(one, following) for one in level for following in follows[one]]
+        level = []
+        for one, following in pairs if step <= depth else ():
+            if following not in steps:
+                steps[following], parents[following] = step, one
+                level.append(following)
+    grown: dict[DatumRead, Tree] = {}
+    for one in reversed(steps):
+        if steps[one] == depth:
+            grown[one] = search.made(kind, one, unfollowed=len(follows[one]))
+            continue
+        children = [
+            grown[following]
+            if parents.get(following) == one
+            else search.made(kind, following, elsewhere=True)
+            for following in follows[one]
+        ]
+        grown[one] = search.made(kind, one, tuple(children))
+    return grown[root]
+
+
+class _Search:
+    """What the shards know of versions, asked for step by step."""
+
+    def __init__(self, client: CellClient) -> None:
+        self._client = client
+        self._known: dict[DatumRead, VersionEntry] = {}
+        self._left_out: dict[object, int] = {}
+        self._now_ns = 0
+
+    def start(self, slot: Slot, version: int) -> DatumRead:
+        """Return the version to begin with (0: the newest).
+
+        Raises:
+            NullDatumError: The slot was never set, or is lost with a volatile shard.
+            ForgottenError: The version has left its retention.
+            MisuseError: There was no such version yet.
+        """
+        asked = dict.fromkeys((SlotVersion(slot, 0), SlotVersion(slot, version)))
+        entries = self._explained(asked)
+        newest = max((entry.state for entry in entries), key=_version_of, default=None)
+        if newest is None or not newest.version:
+            reason = NullReason[(newest and newest.null_reason) or "NEVER_SET"].value
+            raise NullDatumError(f"{slot} is null ({reason}): nothing led to it", reason=reason)
+        wanted = version or newest.version
+        for entry in entries:
+            if entry.state.version == wanted:
+                self._known[_read_of(entry)] = entry
+                return _read_of(entry)
+        if not 0 < version < newest.version:
+            raise MisuseError(f"{slot} has no version {version}; the newest is {newest.version}")
+        history = ListHistory((slot.context,), (slot.entity,), (slot.aspect,))
+        answer = versions_in(self._client.call(self._client.shard_of(slot.entity), history))
+        oldest = answer.entries[0].state if answer.entries else newest
+        raise ForgottenError(
+            f"version {version} of {slot} has left its retention; the oldest that is known is"
+            f" {oldest.version} (a larger retention, or cell.keep, keeps more)",
+            oldest_ns=oldest.stamp_ns,
+        )
+
+    def causes(self, level: Sequence[DatumRead]) -> dict[DatumRead, Sequence[DatumRead]]:
+        """Return what each of these versions was made of."""
+        unknown = {one: None for one in level if one not in self._known}
+        asked = [SlotVersion(one.slot, one.version) for one in unknown if one.version]
+        for entry in self._explained(asked):
+            if _read_of(entry) in unknown:  # otherwise the number belongs to another, newer version
+                self._known[_read_of(entry)] = entry
+        for one in level:
+            self._left_out[one] = self._cause(one).reads_left_out
+        return {one: sorted(self._cause(one).reads, key=partial(_as_read, one)) for one in level}
+
+    def _cause(self, one: DatumRead) -> Cause:
+        entry = self._known.get(one)
+        return entry.cause if entry is not None and entry.cause is not None else _NOBODY
+
+    def effects(self, level: Sequence[DatumRead]) -> dict[DatumRead, Sequence[DatumRead]]:
+        """Return what each of these versions went into."""
+        found: dict[DatumRead, dict[DatumRead, None]] = {one: {} for one in level}
+        shards = self._client.shards()
+        calls = [
+            (shard, FindEffects(some)) for shard in shards for some in _in_parts(level, ASKED_MAX)
+        ]
+        for entry in self._asked(calls):
+            made = _read_of(entry)
+            self._known[made] = entry
+            for read in self._cause(made).reads:
+                if read in found:
+                    found[read][made] = None
+        return {one: sorted(made, key=_as_made) for one, made in found.items()}
+
+    def _explained(self, versions: Iterable[SlotVersion]) -> list[VersionEntry]:
+        by_shard: dict[str, list[SlotVersion]] = {}
+        for version in versions:
+            by_shard.setdefault(self._client.shard_of(version.slot.entity), []).append(version)
+        return self._asked(
+            [
+                (shard, Explain(some))
+                for shard, wanted in by_shard.items()
+                for some in _in_parts(wanted, ASKED_MAX)
+            ]
+        )
+
+    def _asked(self, calls: Sequence[tuple[str, Request]]) -> list[VersionEntry]:
+        entries: list[VersionEntry] = []
+        for answer in map(versions_in, self._client.call_all(calls)):
+            self._now_ns = max(self._now_ns, answer.stamp_ns)
+            entries += answer.entries
+        return entries
+
+    def made(
+        self,
+        kind: type[Tree],
+        one: DatumRead,
+        children: tuple[Tree, ...] = (),
+        *,
+        elsewhere: bool = False,
+        unfollowed: int = 0,
+    ) -> Tree:
+        """Return a version as a part of a tree."""
+        slot, version, stamp_ns = one
+        entry, cause = self._known.get(one), self._cause(one)
+        reason = entry.state.null_reason if entry is not None else ""
+        nothing = NULL if not version else FORGOTTEN if entry is None else UNKNOWN
+        return kind(
+            world=slot.context,
+            entity=Entity(slot.entity),
+            aspect=slot.aspect,
+            version=version,
+            position=Position(stamp_ns, self._client.shard_of(slot.entity)),
+            age_s=max(0, self._now_ns - stamp_ns) / 1e9 if stamp_ns else 0.0,
+            kind=cause.kind or nothing,
+            actor=cause.actor,
+            host=cause.host,
+            pid=cause.pid,
+            stamp_ns=entry.state.captured_ns if entry is not None else 0,
+            held_s=cause.held_ns / 1e9,
+            null_reason=NullReason[reason].value if reason else "",
+            left_out=self._left_out.get(one, 0),
+            elsewhere=elsewhere,
+            unfollowed=unfollowed,
+            children=children,
+        )
+
+
+def _read_of(entry: VersionEntry) -> DatumRead:
+    return DatumRead(*entry.state[:3])
+
+
+def _version_of(state: SlotState) -> int:
+    return state.version
+
+
+def _in_parts(all_of_them: Sequence[Part], most: int) -> Iterator[tuple[Part, ...]]:
+    for start in range(0, len(all_of_them), most):
+        yield tuple(all_of_them[start : start + most])
+
+
+def _as_read(by: DatumRead, read: DatumRead) -> tuple[object, ...]:
+    """Order what a version was made of: by name, the version that it replaced last."""
+    return read.slot == by.slot, *_as_named(read.slot), read.stamp_ns
+
+
+def _as_made(made: DatumRead) -> tuple[object, ...]:
+    """Order what came of a version: by time."""
+    return made.stamp_ns, *_as_named(made.slot)
+
+
+def _as_named(slot: Slot) -> Iterator[list[str | int]]:
+    """Order names as people do: number 10 after number 9."""
+    for name in (slot.context, slot.entity, slot.aspect):
+        yield [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", name)]

@@ -1,0 +1,379 @@
+"""What a cell tells people about its slots, locks, shards, actors and operators."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Final
+
+from enact_dist.core.protocol.datum import Position
+from enact_dist.core.protocol.messages import (
+    ListSessions,
+    Refused,
+    Sessions,
+    Survey,
+    Surveyed,
+    Welcome,
+)
+from enact_dist.core.state.retention import NO_LIMIT, limits_of
+from enact_dist.errors import LinkError, ProtocolError
+from enact_dist.link.refusals import error_of
+from enact_dist.terms import Entity, NullReason
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from enact_dist.access.session import Session
+    from enact_dist.core.protocol.messages import Answer, AspectEntry, Holder, SlotState
+    from enact_dist.link.client.locks import CellClient
+
+
+@dataclass(frozen=True, slots=True)
+class AspectInfo:
+    """One aspect as some shards know it, all of them in the same way.
+
+    Attributes:
+        aspect: Its name.
+        type: The fingerprint of its type; "" where no type is registered, though there are slots.
+            A ``=`` marks fields that have a default.
+        durability: What its data survive, "" as well.
+        versions: So many of each slot are retained, the newest one included; None: without limit.
+        age_s: For so long after they were replaced; None likewise.
+        history_bytes: So many bytes of replaced ones; None likewise.
+        shards: Those that know it so.
+        slots: How many there are on these shards, null ones too.
+        data: How many of these are not null.
+        size_bytes: Of the newest data, each counted as in `SlotInfo`.
+        older_types: The fingerprints of the types that this one has succeeded, the oldest first.
+    """
+
+    aspect: str
+    type: str
+    durability: str
+    versions: int | None
+    age_s: float | None
+    history_bytes: int | None
+    shards: tuple[str, ...]
+    slots: int = 0
+    data: int = 0
+    size_bytes: int = 0
+    older_types: tuple[str, ...] = ()
+
+
+def aspect_infos(session: Session, world: str = "") -> tuple[AspectInfo, ...]:
+    """Return the aspects of all shards; one that shards know differently comes once for each way.
+
+    Args:
+        session: The session that asks.
+        world: Only slots of this world context count; "": those of all.
+
+    Raises:
+        ShardUnreachableError: A shard does not answer.
+    """
+    client = session.client
+    shards = client.shards()
+    request = Survey((world,) if world else (), (), ())
+    answers = client.call_all([(shard, client.core.hello(shard)) for shard in shards])
+    surveys = client.call_all([(shard, request) for shard in shards])
+    found: dict[AspectInfo, AspectInfo] = {}
+    for shard, answer, survey in zip(shards, answers, surveys, strict=True):
+        for info in _of_shard(answer, survey):
+            known_as = replace(info, slots=0, data=0, size_bytes=0)
+            before = found.get(known_as, known_as)
+            found[known_as] = replace(
+                info,
+                shards=(*before.shards, shard),
+                slots=before.slots + info.slots,
+                data=before.data + info.data,
+                size_bytes=before.size_bytes + info.size_bytes,
+            )
+    return tuple(sorted(found.values(), key=lambda info: (info.aspect, info.shards)))
+
+
+def _of_shard(answer: Answer, survey: Answer) -> list[AspectInfo]:
+    if isinstance(answer, Refused):
+        raise error_of(answer)
+    if not isinstance(answer, Welcome) or not isinstance(survey, Surveyed):
+        came = f"{type(answer).__name__} and {type(survey).__name__}"
+        raise ProtocolError(f"{came} came as the answers to Hello and Survey")
+    infos = {entry.name: _info(entry) for entry in answer.aspects}
+    states: dict[str, list[SlotState]] = {name: [] for name in infos}
+    for state in survey.states:
+        states.setdefault(state.slot.aspect, []).append(state)
+    nobody = AspectInfo("", "", "", None, None, None, ())
+    return [
+        replace(
+            infos.get(name, replace(nobody, aspect=name)),
+            slots=len(some),
+            data=sum(1 for state in some if not state.null_reason),
+            size_bytes=sum(state.size for state in some),
+        )
+        for name, some in states.items()
+    ]
+
+
+def _info(entry: AspectEntry) -> AspectInfo:
+    versions, age_ns, size = (None if one == NO_LIMIT else one for one in limits_of(entry))
+    age_s = None if age_ns is None else age_ns / 1e9
+    return AspectInfo(
+        entry.name,
+        entry.fingerprint,
+        entry.durability,
+        versions,
+        age_s,
+        size,
+        (),
+        older_types=entry.older,
+    )
+
+
+RUNNING: Final = ("starting", "running", "stuck")
+"""States in the report of an actor that has not ended."""
+
+
+@dataclass(frozen=True, slots=True)
+class LockInfo:
+    """One lock that is held or awaited at a shard; times in seconds.
+
+    Attributes:
+        number: What `Cell.break_lock` takes; unique within the shard's epoch.
+        modes: "read", "write" or both.
+        waits_for: Numbers of the locks in the way.
+    """
+
+    shard: str
+    number: int
+    lock_id: str
+    actor: str
+    host: str
+    pid: int
+    granted: bool
+    modes: str
+    age_s: float
+    lease_left_s: float
+    hold_left_s: float
+    slots: tuple[str, ...]
+    waits_for: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ShardInfo:
+    """One shard of the cell; `reachable` False leaves everything else at zero.
+
+    Attributes:
+        reachable: Whether it answers, and this process may use the way to it.
+        open: Whether it grants locks; False while it waits for older leases to end after a start,
+            and while it ends.
+        size_bytes: Of the newest data, each counted as in `SlotInfo`.
+        clock_ahead_s: Its wall clock less ours, half a round trip taken off.
+        round_trip_s: Of the call that asked.
+        carrier: How this process's calls to it travel: "socket", or "zenoh" and why.
+        counters: Its statistics by name.
+        problem: Why it is not reachable, empty where it just does not answer.
+    """
+
+    name: str
+    endpoint: str
+    reachable: bool
+    epoch: int = 0
+    open: bool = False
+    uptime_s: float = 0.0
+    slots: int = 0
+    size_bytes: int = 0
+    sessions: int = 0
+    locks: int = 0
+    clock_ahead_s: float = 0.0
+    round_trip_s: float = 0.0
+    carrier: str = ""
+    counters: dict[str, int] = field(default_factory=dict)
+    problem: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ActorInfo:
+    """One session of a named actor, as the shards see it.
+
+    Attributes:
+        lease_left_s: Below 0: time since its lease expired without contact to a shard.
+        report: The actor's own statistics; empty if it sends none.
+        namesakes: Further sessions, none of them silent, with an actor of the same name.
+    """
+
+    actor: str
+    host: str
+    pid: int
+    session: str
+    shards: tuple[str, ...]
+    lease_left_s: float
+    locks: int
+    report: dict[str, Any] = field(default_factory=dict)
+    namesakes: tuple[str, ...] = ()
+
+    @property
+    def silent(self) -> bool:
+        """Whether its lease is over, so that its last report no longer describes its state."""
+        return self.lease_left_s < 0.0
+
+    def names(self) -> frozenset[str]:
+        """Return the names of the actors that run in this session, as they report it."""
+        reported = self.report.get("actors")
+        rows = reported if isinstance(reported, (list, tuple)) else ()
+        running = [row for row in rows if isinstance(row, dict) and row.get("state") in RUNNING]
+        return frozenset(str(row.get("name")) for row in running)
+
+
+@dataclass(frozen=True, slots=True)
+class AuditInfo:
+    """An act of an operator at a shard, or what came of one.
+
+    Attributes:
+        stamp_s: When, by the shard's wall clock, seconds since 1970.
+        kind: "broken" or "forced" (the action), "confirmed" or "alarm" (the answer of a lost shard
+            once it was back), "settled" (an operator has settled all earlier alarms).
+        text: Who or what, and the reason that was given.
+        identity: Requester, as actor@host:pid; empty for the shard's own findings.
+    """
+
+    shard: str
+    stamp_s: float
+    kind: str
+    text: str
+    identity: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class SlotInfo:
+    """One slot of a world context, without its datum.
+
+    Attributes:
+        size_bytes: Length of the datum's body: arrays, texts and bytes over 256 B, long lists; 0
+            for all else.
+        null_reason: Why it is null, or the empty string.
+        shard: Where it lies.
+    """
+
+    entity: Entity
+    aspect: str
+    version: int
+    position: Position
+    size_bytes: int
+    null_reason: str
+    shard: str
+
+
+def slot_info(shard: str, state: SlotState) -> SlotInfo:
+    """Return a shard's description of a slot."""
+    return SlotInfo(
+        Entity(state.slot.entity),
+        state.slot.aspect,
+        state.version,
+        Position(state.stamp_ns, shard),
+        state.size,
+        NullReason[state.null_reason].value if state.null_reason else "",
+        shard,
+    )
+
+
+def actor_infos(told: Iterable[tuple[str, Answer | None]]) -> tuple[ActorInfo, ...]:
+    """Return the sessions of named actors, from the answers of all shards that answered."""
+    found: dict[str, ActorInfo] = {}
+    for shard, answer in told:
+        for info in answer.sessions if isinstance(answer, Sessions) else ():
+            if not info.actor:
+                continue
+            before = found.get(info.session)
+            left_s = info.lease_left_ns / 1e9
+            found[info.session] = ActorInfo(
+                info.actor,
+                info.host,
+                info.pid,
+                info.session,
+                (*(before.shards if before else ()), shard),
+                max(left_s, before.lease_left_s) if before else left_s,
+                info.locks + (before.locks if before else 0),
+                _report(info.report) or (before.report if before else {}),
+            )
+    infos = sorted(found.values(), key=lambda info: (info.actor, info.session))
+    return tuple(_with_namesakes(infos))
+
+
+def _with_namesakes(infos: list[ActorInfo]) -> Iterator[ActorInfo]:
+    sessions: dict[str, list[str]] = {}
+    for info in infos:
+        for name in info.names() if not info.silent else ():
+            sessions.setdefault(name, []).append(info.session)
+    for info in infos:
+        same = {other for name in info.names() for other in sessions.get(name, ())}
+        others = tuple(sorted(same - {info.session}))
+        yield replace(info, namesakes=others) if others else info
+
+
+def _report(encoded: bytes) -> dict[str, Any]:
+    """Return an actor's report; empty if invalid, since a client may send anything."""
+    import msgpack
+
+    try:
+        report = msgpack.unpackb(encoded) if encoded else {}
+    except (ValueError, msgpack.UnpackException):
+        return {}
+    return report if isinstance(report, dict) else {}
+
+
+def lock_info(shard: str, holder: Holder) -> LockInfo:
+    """Return a shard's description of a lock in seconds."""
+    return LockInfo(
+        shard,
+        holder.number,
+        str(holder.lock),
+        holder.actor,
+        holder.host,
+        holder.pid,
+        holder.granted,
+        holder.modes,
+        holder.age_ns / 1e9,
+        holder.lease_left_ns / 1e9,
+        holder.hold_left_ns / 1e9,
+        holder.slots,
+        holder.waits_for,
+    )
+
+
+def shard_info(client: CellClient, shard: str) -> ShardInfo:
+    """Return what is known of a shard.  A shard that fails does not affect the others' results."""
+    try:
+        return _asked_info(client, shard)
+    except LinkError as error:
+        endpoint = client.carrier.endpoint_of(shard)
+        return ShardInfo(shard, endpoint, reachable=False, problem=str(error))
+
+
+def _asked_info(client: CellClient, shard: str) -> ShardInfo:
+    question = (shard, ListSessions())
+    endpoint = client.carrier.endpoint_of(shard)
+    if client.core.needs_hello(shard):
+        # How calls travel is known from its welcome on.  Who is silent is waited for once.
+        hello = (shard, client.core.hello(shard))
+        if client.call_once([hello, question])[1] is None:
+            return ShardInfo(shard, endpoint, reachable=False)
+    started_s = time.monotonic()
+    answer = client.call_once([question])[0]
+    round_trip_s = time.monotonic() - started_s
+    if not isinstance(answer, Sessions):
+        return ShardInfo(shard, endpoint, reachable=False)
+    ahead_ns = answer.wall_ns - time.time_ns() + round_trip_s * 1e9 / 2
+    return ShardInfo(
+        shard,
+        endpoint,
+        reachable=True,
+        epoch=answer.epoch,
+        open=answer.open,
+        uptime_s=answer.uptime_ns / 1e9,
+        slots=answer.slots,
+        size_bytes=answer.bytes,
+        sessions=len(answer.sessions),
+        locks=sum(session.locks for session in answer.sessions),
+        clock_ahead_s=ahead_ns / 1e9,
+        round_trip_s=round_trip_s,
+        carrier=client.carrier.way_to(shard),
+        counters={counter.name: counter.value for counter in answer.counters},
+    )
