@@ -18,6 +18,7 @@ depth                   depth image <-> points, filters, the sensor's spread
 rendering               surface -> depth image as a camera would see it
 reconstruction          one view's cloud -> triangles and planar patches
 fusion                  all views of a product -> one complete surface
+outlines                a surface's outline, and what a camera sees of it beside others
 registration            where a known surface lies in a cloud of the tray
 segmentation            what is new on the tray, piece by piece
 deviation               render and compare: missing, extra, moved, deformed

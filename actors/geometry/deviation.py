@@ -14,6 +14,7 @@ Source: ENACT 4.2 (deviation detection actor).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -26,6 +27,8 @@ from actors.geometry.rendering import render_depth
 from actors.geometry.segmentation import Piece, new_pieces, pixel_area_m2, rise, unhidden
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import numpy.typing as npt
 
     from actors.geometry.shapes import DepthFrame, Surface
@@ -59,6 +62,8 @@ class Limits:
     of 96 dents of 3 mm, 14 to 22 mm wide, anywhere in seen faces, 92 had more than 100 mm2.
 
     Attributes:
+        height_m: What all of a package may seem too high or too low, metres: sound ones by up to
+            0.12 mm. A wide dent in a small lid moves the middle of all differences by 1.5 mm.
         depth_spreads: Of the sensor's spread at the pixel, part of the limit of a depth difference;
             the filters leave 0.12 spreads of noise.
         depth_m: The other part: what model and registration are off on a flat face, metres.
@@ -67,6 +72,7 @@ class Limits:
             registration is off by less than 1.
         beside_px: Width of the band around the product where nothing counts as foreign.
         deformed_m2: Least area of a deformation, square metres.
+        deformed_m: Least depth of one, metres: dents of 3 mm were measured as 1.9 and more.
         extra_m2: Least area of a foreign object outside the band, square metres.
         moved_m: Largest shift of a package in its place, metres.
         turned_rad: Largest turn.
@@ -74,12 +80,14 @@ class Limits:
         present_share: Share of the product's area that must have come for it to be there.
     """
 
+    height_m: float = 0.0003
     depth_spreads: float = 0.3
     depth_m: float = 0.0006
     slope_m: float = 0.0007
     edge_px: int = 4
     beside_px: int = 6
     deformed_m2: float = 0.0001
+    deformed_m: float = 0.0015
     extra_m2: float = 0.00025
     moved_m: float = 0.010
     turned_rad: float = float(np.deg2rad(8.0))
@@ -122,6 +130,7 @@ def inspect_place(
     planned: Pose,
     *,
     limits: Limits | None = None,
+    others: Sequence[Pose] = (),
 ) -> Finding:
     """Judge what has come onto the tray since an earlier image.
 
@@ -131,6 +140,8 @@ def inspect_place(
         surface: The trained product, product frame.
         planned: tray_from_product as planned, (4, 4).
         limits: Where a difference becomes a deviation; the calibrated ones when absent.
+        others: tray_from_product of what stands at other places: a thing that lies nearer to one
+            of these, apart from this package, is nothing extra here.
 
     Returns:
         The verdict with its evidence.
@@ -139,10 +150,10 @@ def inspect_place(
     pieces = new_pieces(frame, before_mm)
     area_m2 = np.nan_to_num(pixel_area_m2(frame))
     expected = render_depth([(surface, planned)], frame.acquisition)
-    product_m2 = float(_areas_of(expected, frame).sum())
-    if not pieces or pieces[0].area_m2 < limits.present_share * product_m2:
+    least_m2 = limits.present_share * float(_areas_of(expected, frame).sum())
+    piece = _package(pieces, least_m2, planned)
+    if piece is None:
         return _missing(expected, before_mm, frame, planned)
-    piece = pieces[0]
     before_m = metres(before_mm)
     found = register(
         piece.cloud, piece.outline_m, surface, planned, seen_by=frame.acquisition, before_m=before_m
@@ -151,11 +162,9 @@ def inspect_place(
     shift_m = float(np.hypot(*(pose[:2, 3] - planned[:2, 3])))
     turn = yaw_between(yaw_of(planned), yaw_of(pose))
     rendered = render_depth([(surface, pose)], frame.acquisition)
+    pieces = [piece, *_beside_it(pieces, piece, (planned, pose), others)]
     foreign = _foreign(pieces, np.isfinite(rendered), limits)
-    difference, limit_m = depth_difference(frame, unhidden(rendered, before_m), limits)
-    with np.errstate(invalid="ignore"):
-        bent = _largest_blob(np.abs(difference) > limit_m, area_m2)
-    bent_m2 = float(area_m2[bent].sum())
+    bent, bent_m = _deformed(frame, unhidden(rendered, before_m), limits)
 
     def finding(verdict: str, deviation_m: float, region: Mask) -> Finding:
         area = float(area_m2[region].sum())
@@ -163,7 +172,7 @@ def inspect_place(
 
     too_much = area_m2[foreign].sum() >= limits.extra_m2
     off = shift_m > limits.moved_m or abs(turn) > limits.turned_rad
-    if too_much or off or bent_m2 >= limits.deformed_m2:
+    if too_much or off or bent_m:
         leaves_m = LEANS_FUSED_M if frame.depth_mm.dtype == np.float32 else LEANS_M
         lies = _tipped(piece, surface, found, limits.tipped_rad, leaves_m)
         if lies is not None:
@@ -179,8 +188,8 @@ def inspect_place(
         return finding("tipped", _higher(surface, pose), np.isfinite(rendered))
     if off:
         return finding("moved", shift_m, np.isfinite(rendered))
-    if bent_m2 >= limits.deformed_m2:
-        return finding("deformed", float(np.percentile(np.abs(difference[bent]), 95)), bent)
+    if bent_m:
+        return finding("deformed", bent_m, bent)
     return finding("ok", 0.0, np.zeros_like(bent))
 
 
@@ -224,8 +233,9 @@ def depth_difference(frame: DepthFrame, rendered_m: Image, limits: Limits) -> tu
     inside = _shrunk(known, limits.edge_px)
     smooth[~inside] = np.nan
     if inside.any():
-        # Two calibrations (arm and overhead) disagree by up to a millimetre in height.
-        smooth -= np.float32(np.clip(np.nanmedian(smooth[inside]), -0.001, 0.001))
+        # Two calibrations (arm and overhead) disagree a little in height.
+        median_m = np.nanmedian(smooth[inside])
+        smooth -= np.float32(np.clip(median_m, -limits.height_m, limits.height_m))
     slope_limit = limits.slope_m * slope_of(rendered_m, frame.acquisition.camera.fx_px)
     limit = limits.depth_spreads * spread_m(rendered_m) + limits.depth_m + slope_limit
     return smooth, limit.astype(np.float32)
@@ -238,6 +248,18 @@ def slope_of(rendered_m: Image, focal_px: float) -> Image:
     filled = np.nan_to_num(rendered_m).astype(np.float32)
     slope = np.hypot(cv2.Sobel(filled, cv2.CV_32F, 1, 0), cv2.Sobel(filled, cv2.CV_32F, 0, 1)) / 8.0
     return np.asarray(slope / (rendered_m / focal_px), np.float32)
+
+
+def _deformed(frame: DepthFrame, rendered_m: Image, limits: Limits) -> tuple[Mask, float]:
+    """Return the largest deformed region and its depth, metres; 0 if it is too small or slight."""
+    difference, limit_m = depth_difference(frame, rendered_m, limits)
+    area_m2 = np.nan_to_num(pixel_area_m2(frame))
+    with np.errstate(invalid="ignore"):
+        bent = _largest_blob(np.abs(difference) > limit_m, area_m2)
+    if area_m2[bent].sum() < limits.deformed_m2:
+        return bent, 0.0
+    depth_m = float(np.percentile(np.abs(difference[bent]), 95))
+    return bent, depth_m if depth_m >= limits.deformed_m else 0.0
 
 
 def _missing(
@@ -258,6 +280,28 @@ def _missing(
         tray_from_product=planned,
         region=region,
     )
+
+
+def _package(pieces: Sequence[Piece], least_m2: float, planned: Pose) -> Piece | None:
+    """Return the piece that is taken for the package: the nearest that is large enough."""
+    large = (each for each in pieces if each.area_m2 >= least_m2)
+    return min(large, key=lambda each: math.dist(each.centre_m[:2], planned[:2, 3]), default=None)
+
+
+def _beside_it(
+    pieces: Sequence[Piece], package: Piece, own: Sequence[Pose], others: Sequence[Pose]
+) -> list[Piece]:
+    """Return the pieces that lie nearer to a package, or its place, than to all others."""
+
+    def nearest_m(piece: Piece, poses: Sequence[Pose]) -> float:
+        away = [math.dist(piece.centre_m[:2], pose[:2, 3]) for pose in poses]
+        return min(away, default=math.inf)
+
+    return [
+        each
+        for each in pieces
+        if each is not package and nearest_m(each, own) < nearest_m(each, others)
+    ]
 
 
 def _foreign(pieces: list[Piece], product: Mask, limits: Limits) -> Mask:

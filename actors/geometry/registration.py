@@ -18,13 +18,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from actors.geometry.depth import points_grid
 from actors.geometry.fusion import vertex_normals
 from actors.geometry.open3d_arrays import point_cloud, tensor
 from actors.geometry.open3d_on_use import open3d
+from actors.geometry.outlines import OutlineField, unbiased
 from actors.geometry.poses import inverse, moved, on_tray, turned, yaw_between, yaw_of
-from actors.geometry.rendering import ray_scene, render_depth
-from actors.geometry.segmentation import RISE_MIN_M, outline_of
+from actors.geometry.rendering import ray_scene
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -50,12 +49,6 @@ INLIER_M: Final = 0.004
 EQUAL_COST_M: Final = 0.0001
 """Turns whose mean distance differs by less are equally good."""
 
-
-OUTLINE_CELL_M: Final = 0.001
-"""Grid of the outline's distances; interpolation makes it finer than the sensor's 1.5 mm pixels."""
-
-OUTLINE_MARGIN_M: Final = 0.05
-"""How far around the product the distances reach; farther points count like the border."""
 
 STANDING: Final = ((0.0, 0.0),)
 LYING: Final = tuple(
@@ -98,7 +91,7 @@ def register(
         surface: Its trained surface, product frame.
         expected: tray_from_product as planned, (4, 4).
         seen_by: The camera that saw the outline, and its pose in the tray frame; takes out what
-            outlines are off in its images.
+            outlines are off in its images, see `outlines.unbiased`.
         before_m: (H, W), its image without the product, metres; a neighbour hides part of an
             outline. A bare tray when absent.
 
@@ -123,113 +116,8 @@ def register(
     )
     if seen_by is None:
         return found
-    pose = field.without_bias(surface, found.tray_from_product, seen_by, before_m)
+    pose = unbiased(field, outline_m, surface, found.tray_from_product, seen_by, before_m)
     return Registration(pose, found.distance_m)
-
-
-class OutlineField:
-    """Distances to the outline of a surface as seen from above, on a grid.
-
-    Args:
-        surface: Product frame.
-        scene: Of the surface, from `ray_scene`.
-    """
-
-    def __init__(self, surface: Surface, scene: Any) -> None:
-        from scipy.ndimage import binary_closing, distance_transform_edt
-
-        self._low = surface.vertices_m[:, :2].min(axis=0) - OUTLINE_MARGIN_M
-        high = surface.vertices_m[:, :2].max(axis=0) + OUTLINE_MARGIN_M
-        columns, rows = np.ceil((high - self._low) / OUTLINE_CELL_M).astype(int)
-        x = self._low[0] + OUTLINE_CELL_M * np.arange(columns)
-        y = self._low[1] + OUTLINE_CELL_M * np.arange(rows)
-        rays = np.zeros((rows, columns, 6), np.float32)
-        rays[..., 0], rays[..., 1] = np.meshgrid(x, y)
-        rays[..., 2], rays[..., 5] = surface.vertices_m[:, 2].max() + 0.1, -1.0
-        hit = np.isfinite(scene.cast_rays(tensor(rays))["t_hit"].numpy())
-        inside = binary_closing(hit, iterations=2) | hit
-        outwards = distance_transform_edt(~inside) - distance_transform_edt(inside)
-        # The outline runs between the last point inside and the first outside.
-        self._distance_m = OUTLINE_CELL_M * (outwards - 0.5 * np.sign(outwards))
-        self._slope = np.gradient(self._distance_m, OUTLINE_CELL_M)[::-1]
-
-    def fitted(self, outline_m: npt.NDArray[np.floating], start: Pose) -> Pose:
-        """Return the upright pose near `start` that puts points onto the outline, robustly.
-
-        Args:
-            outline_m: (K, 2), tray frame, metres.
-            start: tray_from_product to start from; its z and tilt are ignored.
-        """
-        from scipy.ndimage import map_coordinates
-        from scipy.optimize import least_squares
-
-        centre = outline_m.mean(axis=0)
-        back = inverse(start)
-
-        def local(freedoms: Pose) -> tuple[Pose, Pose, Pose]:
-            # Turning about the middle of the points keeps the freedoms independent.
-            turn = back[:2, :2] @ on_tray(0.0, 0.0, -freedoms[2])[:2, :2]
-            beside = outline_m - centre - freedoms[:2]
-            at = beside @ turn.T + back[:2, :2] @ centre + back[:2, 3]
-            return turn, beside, (at - self._low).T[::-1] / OUTLINE_CELL_M
-
-        def distances(freedoms: Pose) -> Pose:
-            cell = local(freedoms)[2]
-            return np.asarray(map_coordinates(self._distance_m, cell, order=1, mode="nearest"))
-
-        def slopes(freedoms: Pose) -> Pose:
-            turn, beside, cell = local(freedoms)
-            slope = np.stack(
-                [map_coordinates(each, cell, order=1, mode="nearest") for each in self._slope], 1
-            )
-            round_it = np.column_stack([beside[:, 1], -beside[:, 0]]) @ turn.T
-            return np.column_stack([-slope @ turn, np.einsum("ij,ij->i", slope, round_it)])
-
-        solved = least_squares(
-            distances,
-            np.zeros(3),
-            jac=slopes,
-            loss="arctan",
-            f_scale=0.004,
-            x_scale=[0.01, 0.01, 0.1],
-            max_nfev=40,
-            xtol=1e-6,
-            ftol=1e-6,
-        )
-        found = on_tray(0.0, 0.0, solved.x[2])
-        found[:2, 3] = centre + solved.x[:2] - found[:2, :2] @ centre
-        pose = found @ start
-        return on_tray(pose[0, 3], pose[1, 3], yaw_of(pose))
-
-    def without_bias(
-        self,
-        surface: Surface,
-        pose: Pose,
-        seen_by: Acquisition,
-        before_m: npt.NDArray[np.float32] | None = None,
-    ) -> Pose:
-        """Return a fitted pose without what fitting outlines of this product is off there.
-
-        An outline in an image is not quite that from right above: walls are seen aslant, and low
-        parts count as ground. What the fit makes of the product's own image tells by how much.
-
-        Args:
-            surface: Product frame.
-            pose: What `fitted` found.
-            seen_by: The camera that saw the outline, and its pose in the tray frame.
-            before_m: See `register`.
-        """
-        depth_m = render_depth([(surface, pose)], seen_by)
-        if before_m is not None:
-            depth_m[~(before_m - depth_m > RISE_MIN_M)] = np.nan
-        world = points_grid(depth_m, seen_by.camera) @ seen_by.world_from_camera[:3, :3].T
-        world += seen_by.world_from_camera[:3, 3]
-        with np.errstate(invalid="ignore"):
-            outline = outline_of(world[..., 2] > RISE_MIN_M)
-        if not outline.any():
-            return pose
-        again = self.fitted(world[outline][:, :2].astype(float), pose)
-        return np.asarray(pose @ inverse(again) @ pose)
 
 
 def _seeds(surface: Surface, centre_m: Pose, expected: Pose) -> list[Pose]:

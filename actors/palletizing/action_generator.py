@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from actors.palletizing.controller import ArmController
+    from actors.palletizing.grounding import Beside
     from actors.palletizing.vocabulary import Attached, Request
     from enact_dist import Lock
 
@@ -61,8 +62,8 @@ if TYPE_CHECKING:
 class ActionGenerator(Actor):
     """Ground the next stage of the request; say how the request ended, and take the arm aside.
 
-    Before the first stage of a request that can spoil what stands on the tray it forks the online
-    context and writes there what it expects, see `expectation`.
+    Before each stage that can spoil what stands on the tray it forks the online context and writes
+    there what it expects, see `expectation`.
 
     Args:
         controller: Address of the arm, for its kinematics, see `open_controller`.
@@ -137,8 +138,8 @@ class ActionGenerator(Actor):
         except NetError as error:
             return str(error)
         if left[0] in RISKY:
-            plan, flags = known.plans[request.place], lock.get(self.flags, {})
-            self.expectations.before(joined(self), request, plan, flags)
+            flags = lock.get(self.flags, {})
+            self.expectations.before(joined(self), request, left[0], known, flags)
         self._write(lock, Candidate(request.number, left[0], net, "", frames, turned))
         return ""
 
@@ -188,11 +189,12 @@ class ActionGenerator(Actor):
         assert self._arm is not None
         return Stages(request, handled, known, arm=self._arm.model, gripper=Gripper())
 
-    def _beside(
-        self, lock: Lock, request: Request
-    ) -> tuple[tuple[str, npt.NDArray[np.float64], npt.NDArray[np.float64]], ...]:
-        """Return what stands beside a package that is to be taken from the tray."""
-        if "regrasp" not in self._stages(lock, request):
+    def _beside(self, lock: Lock, request: Request) -> Beside:
+        """Return what stands beside a package that is not where packages come.
+
+        One that has come by the belt has nothing beside it.
+        """
+        if request.kind == "pack" or not {"grasp", "regrasp"} & set(self._stages(lock, request)):
             return ()
         plans, base_from_tray = lock[self.plans], lock[self.cell_frames]["tray"]
         tray = plans[Entity(request.place)].tray

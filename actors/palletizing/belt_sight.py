@@ -3,6 +3,8 @@
 what is new on the belt -> every trained surface registered to it -> rendered into the sensor
                         -> the one whose image is nearest to what was seen
 
+what stands upright nowhere -> the same surfaces with six freedoms: does one of them lie or lean?
+
 Rules a change must keep: recognised by shape alone, against all trained surfaces; nothing is left
 out because it fits none: its misfit says so.  The height of belt and tray is z = 0 of their frames.
 """
@@ -15,11 +17,13 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from actors.geometry.depth import frame_points, median_known, metres
-from actors.geometry.poses import on_tray
-from actors.geometry.registration import register
+from actors.geometry.deviation import LEANS_M, Limits
+from actors.geometry.poses import inverse, on_tray
+from actors.geometry.registration import leaning, register, tilt_of
 from actors.geometry.rendering import render_depth
 from actors.geometry.segmentation import Piece, new_pieces
 from actors.geometry.shapes import DepthFrame
+from actors.palletizing.rows import TRAY_HALF_M
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -37,6 +41,16 @@ GROUND_M: Final = 0.012
 FAR_OFF_M: Final = 0.012
 """A pixel that is farther off, or seen where nothing should be, or not seen, counts as so far."""
 
+WITHIN_RIM_M: Final = np.array(TRAY_HALF_M) - 0.007
+"""Half of the tray within its rim: packages stand there."""
+
+ON_BELT_SHARE: Final = 0.2
+"""Least share of a thing's pixels that hides the belt: half a package may stand over its edge, and
+what stands on the tray hides none of it."""
+
+LIES_RAD: Final = float(np.deg2rad(45.0))
+"""What is tilted by more lies; by less, it leans against something."""
+
 MISFIT_MAX_M: Final = 0.003
 """Of a package that is what it is taken for; see `BeltSight.known`."""
 
@@ -53,20 +67,71 @@ class BeltSight:
         belt_from_product: Where that stands, (4, 4) float64, metres.
         misfit_m: Mean distance along the optical axis between what was seen and what the product
             would look like there, over the pixels of either, each at most `FAR_OFF_M`.
+        tilt_rad: Between its z axis and the vertical; 0 unless it lies or leans.
     """
 
     product: str
     belt_from_product: Pose
     misfit_m: float
+    tilt_rad: float = 0.0
 
     @property
     def known(self) -> bool:
         """Whether it is that product, whole and upright; what is not is for the operator."""
-        return bool(self.product) and self.misfit_m <= MISFIT_MAX_M
+        return bool(self.product) and self.misfit_m <= MISFIT_MAX_M and not self.tilt_rad
+
+    @property
+    def unfit(self) -> str:
+        """Why no hand takes it, in words; empty if it is known."""
+        if self.known:
+            return ""
+        if not self.tilt_rad:
+            return "what is on the belt is no package that stands upright"
+        if self.tilt_rad <= LIES_RAD:
+            return f"the package leans on the belt by {np.degrees(self.tilt_rad):.0f}°"
+        return "the package lies on its side on the belt"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BeltWatch:
+    """Looks on the belt for one package.
+
+    Attributes:
+        empty: The empty belt.
+        models: Trained surface of each product, product frame.
+        belt_from_tray: See `seen_on_belt`.
+    """
+
+    empty: DepthFrame
+    models: Mapping[str, Surface]
+    belt_from_tray: Pose | None = None
+
+    def sight(self, frame: DepthFrame, product: str) -> BeltSight | None:
+        """Return the sight that is of a package, None if none can be.
+
+        Args:
+            frame: The image now.
+            product: What the package is; "" if that is not known: then any sight is of it.
+
+        Returns:
+            A package that stands, if there is one; otherwise something that does not.  What is
+            recognised as another product is another package.
+        """
+        sights = seen_on_belt(
+            frame, self.empty.depth_mm, self.models, belt_from_tray=self.belt_from_tray
+        )
+        if not product:
+            return next(iter(sights), None)
+        upright = [sight for sight in sights if sight.known and sight.product == product]
+        return next(iter(upright or [sight for sight in sights if not sight.known]), None)
 
 
 def seen_on_belt(
-    frame: DepthFrame, empty_mm: npt.NDArray[np.uint16 | np.float32], models: Mapping[str, Surface]
+    frame: DepthFrame,
+    empty_mm: npt.NDArray[np.uint16 | np.float32],
+    models: Mapping[str, Surface],
+    *,
+    belt_from_tray: Pose | None = None,
 ) -> list[BeltSight]:
     """Recognise and pose everything that lies on the belt and is wholly in the image.
 
@@ -74,6 +139,8 @@ def seen_on_belt(
         frame: The image now; its world is the belt frame, and the sensor looks at the belt.
         empty_mm: (H, W), the image of the empty belt, millimetres.
         models: Trained surface of each product, product frame.
+        belt_from_tray: Where the tray is, (4, 4), metres: what is seen over it is no part of what
+            stands between it and the belt.  None: the tray is nowhere near.
 
     Returns:
         A sight for each thing, the one farthest along the belt (greatest x) first; things that
@@ -81,13 +148,25 @@ def seen_on_belt(
     """
     empty = DepthFrame(np.asarray(empty_mm), frame.acquisition)
     belt = _belt(empty)
+    if belt_from_tray is not None:
+        frame = _without_tray(frame, empty, belt_from_tray)
     seen_m = median_known(metres(frame.depth_mm), 5)
     sights = [
         _recognised(piece, frame, seen_m, models)
         for piece in new_pieces(frame, empty.depth_mm)
-        if belt[piece.mask].mean() > 0.5 and not _cut_off(piece.mask)
+        if belt[piece.mask].mean() > ON_BELT_SHARE and not _cut_off(piece.mask)
     ]
     return sorted(sights, key=lambda sight: -sight.belt_from_product[0, 3])
+
+
+def _without_tray(frame: DepthFrame, empty: DepthFrame, belt_from_tray: Pose) -> DepthFrame:
+    """Return an image with nothing on the tray."""
+    points = frame_points(frame) @ inverse(belt_from_tray)[:3, :3].T
+    points += inverse(belt_from_tray)[:3, 3]
+    with np.errstate(invalid="ignore"):
+        over = (np.abs(points[..., :2]) < WITHIN_RIM_M).all(axis=-1)
+    depth_mm = np.where(over, empty.depth_mm, frame.depth_mm).astype(frame.depth_mm.dtype)
+    return DepthFrame(depth_mm, frame.acquisition)
 
 
 def _belt(empty: DepthFrame) -> Mask:
@@ -130,7 +209,28 @@ def _recognised(
         sight = BeltSight(product, pose, _misfit(seen_m, rendered_m, piece.mask))
         if not best.product or sight.misfit_m < best.misfit_m:
             best = sight
-    return best
+    return best if best.known else _tilted(piece, best, models)
+
+
+def _tilted(piece: Piece, upright: BeltSight, models: Mapping[str, Surface]) -> BeltSight:
+    """Return how something lies or leans that stands upright nowhere; `upright` if no product does.
+
+    Args:
+        piece: What was seen.
+        upright: What it resembles most.
+        models: Trained surface of each product.
+    """
+    fits = {
+        product: leaning(piece.cloud, surface, upright.belt_from_product)
+        for product, surface in models.items()
+    }
+    product = min(fits, key=lambda each: fits[each].distance_m, default="")
+    if not product or fits[product].distance_m > LEANS_M:
+        return upright
+    pose = fits[product].tray_from_product
+    if tilt_of(pose) <= Limits().tipped_rad:
+        return upright
+    return BeltSight(product, pose, upright.misfit_m, tilt_of(pose))
 
 
 def _misfit(

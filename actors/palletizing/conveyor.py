@@ -37,10 +37,12 @@ if TYPE_CHECKING:
     from enact_dist import Lock
 
 OFF_THE_BELT: Final = ("place", "push", "remove")
-"""Stages during which the package is not on the belt."""
+"""Stages after which the package is not on the belt, if they have succeeded."""
 LOOK_S: Final = 0.1
 OVERLOOKED_S: Final = 8.0
 """When a package that has come was still not seen, it is reported again."""
+FREE_S: Final = 2.0
+"""After so long in which nothing stands in the light barrier it is free."""
 LATE_S: Final = 15.0
 """A belt that has brought nothing for so long is started again, and says so."""
 
@@ -89,13 +91,14 @@ class BeltConveyor(Actor):
     empty = View(training, BELT, EMPTY)
     request = View(online, SYSTEM, REQUEST)
     attached = View(online, SYSTEM, NET)
+    outcome = View(online, SYSTEM, OUTCOME)
     results = View(online, SYSTEM, RESULTS)
     arrival = Write(online, CONVEYOR, ARRIVAL)
     every_s = LOOK_S
 
     def __init__(self, controller: str) -> None:
         self.belt: BeltController = open_controller(controller)
-        self._runs_s = 0.0
+        self._runs_s = self._free_s = 0.0
 
     def update(self, lock: Lock) -> None:
         """Start the belt, or say that a package has come."""
@@ -105,6 +108,9 @@ class BeltConveyor(Actor):
         place = place_entity(coming)
         if last is not None and not self._runs_s and self._is_overlooked(lock, last):
             lock[self.arrival] = Arrival(last.number, time.time_ns())
+            return
+        if last is not None and not self._runs_s and self._is_gone(lock, last):
+            lock[self.arrival] = Arrival(last.number, time.time_ns(), is_gone=True)
             return
         if place not in plans or lock.is_null(self.empty):
             return
@@ -137,6 +143,21 @@ class BeltConveyor(Actor):
         waits_s = 1e-9 * (time.time_ns() - last.stamp_ns)
         return is_idle and name not in results and waits_s > OVERLOOKED_S and self.belt.arrived()
 
+    def _is_gone(self, lock: Lock, last: Arrival) -> bool:
+        """Return whether what has come was taken out of the light barrier before it was recognised.
+
+        Whatever a request names as its package is followed by perception; what came and was not
+        recognised has no name.
+        """
+        name, request = place_entity(last.number).name, lock.get(self.request)
+        named = request is not None and request.place == name and bool(request.package)
+        closed = name in lock.get(self.results, {})
+        if last.is_gone or named or closed or self.belt.arrived():
+            self._free_s = 0.0
+            return False
+        self._free_s = self._free_s or time.monotonic()
+        return time.monotonic() - self._free_s >= FREE_S
+
     def _is_free(self, lock: Lock, number: int) -> bool:
         """Return whether a package is off the belt; change the tray if it was its last one.
 
@@ -151,10 +172,15 @@ class BeltConveyor(Actor):
                 self.belt.change_tray()
             return closed
         request, attached = lock.get(self.request), lock.get(self.attached)
-        taken = (
-            request is not None
-            and attached is not None
-            and request.place == place.name
-            and (attached.request == request.number and attached.stage in OFF_THE_BELT)
+        if request is None or request.place != place.name:
+            return done
+        is_pushed = (
+            attached is not None and attached.request == request.number and attached.stage == "push"
         )
-        return done or taken
+        outcome = lock.get(self.outcome)
+        is_off = (
+            outcome is not None
+            and outcome.request == request.number
+            and (outcome.success and outcome.stage in OFF_THE_BELT)
+        )
+        return done or is_pushed or is_off

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING, Final
 
-from actors.palletizing.expectation import PREFIX
+from actors.palletizing.expectation import last_forks
 from actors.palletizing.vocabulary import (
     CANDIDATE,
     CLOUD,
@@ -80,9 +80,8 @@ def show_packing(cell: Cell, console: Console) -> None:
     results, flags = View(online, SYSTEM, RESULTS), View(online, SYSTEM, DEVIATIONS)
     seen = online.view(results, flags)
     judged = {place: flag for place, flag in seen.get(flags, {}).items() if place in seen[results]}
-    for name in sorted(name for name in cell.worlds() if name.startswith(PREFIX)):
-        expected = cell.world(name)
-        for row in expected.diff(online, PLACES, [STANDING]):
+    for name in last_forks(cell):
+        for row in cell.world(name).diff(online, PLACES, [STANDING]):
             if row.left is not None and row.right is not None:
                 console.print(f"{name} against online: {row.entity.name}: {row.difference}")
     bad = [place for place in judged if seen[results][place].result != "placed"]

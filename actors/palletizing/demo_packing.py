@@ -6,7 +6,8 @@ and the actors are processes of their own.  This process only looks.  Files in `
 =======================  ===========================================================================
 model_<product>.png      the trained surface, each planar patch in its colour
 tray_<n>.png             each tray with the deviating regions in red
-cell.png                 the cell, drawn by MuJoCo; deviation_<place>.png: when one was found
+cell.png                 the cell in the midst of the run, drawn by MuJoCo;
+                         deviation_<place>.png: when one was found
 net_<stage>.svg          each net, with the trace of one run
 actors.svg               who reads and writes what, drawn from the declarations
 run.mcap                 the recording
@@ -38,17 +39,18 @@ from actors.palletizing.demo_packing_report import (
 )
 from actors.palletizing.demo_report import difference_of
 from actors.palletizing.demo_robot_cell import RunningRobotCell, watched_robot_cell
+from actors.palletizing.operator import SCRIPT
 from actors.palletizing.vocabulary import (
     CONTROL,
+    DECISION,
     DEVIATIONS,
     NOTICES,
-    DECISION,
     PLACES,
     PLAN,
     PRODUCTS,
+    REQUEST,
     RESULTS,
     ROBOT,
-    REQUEST,
     SCAN,
     STANDING,
     SYSTEM,
@@ -70,7 +72,7 @@ if TYPE_CHECKING:
 
     from actors.palletizing.demo_packing_report import Row
     from actors.palletizing.demo_robot_cell import RobotCell
-    from actors.palletizing.vocabulary import Deviation, Plan
+    from actors.palletizing.vocabulary import Deviation, Notice, Plan
     from enact_dist import Cell
 
     Picture = npt.NDArray[np.uint8]
@@ -178,7 +180,7 @@ def show_cell(demo: RobotCell | RunningRobotCell, out: Path, *, up: str, keep_ru
         with demo as running, running.joined() as cell:
             console.print(f"{up}; log in {running.log}")
             with _recorded(cell, out, console):
-                seen = _follow(cell, running, console)
+                seen = follow(cell, running, console)
             rows = _rows(cell, running, seen)
             console.print("\n", table_of(rows), f"\n{score_of(rows)}", sep="")
             console.print(_told(seen))
@@ -208,11 +210,12 @@ def _recorded(cell: Cell, out: Path, console: Console) -> contextlib.AbstractCon
     return recording(cell, out / "run.mcap")
 
 
-def _follow(cell: Cell, running: RobotCell | RunningRobotCell, console: Console) -> Seen:
+def follow(cell: Cell, running: RobotCell | RunningRobotCell, console: Console) -> Seen:
     """Show progress until every package is done with.
 
     Raises:
-        DemoError: The processes ended, or nothing moved for `STALL_S`.
+        DemoError: The processes ended, the operator's script has stopped the cell, or nothing
+            moved for `STALL_S`.
     """
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
@@ -228,6 +231,8 @@ def _follow(cell: Cell, running: RobotCell | RunningRobotCell, console: Console)
             running.check()
             if time.monotonic() - moved_s > STALL_S:
                 raise DemoError(f"nothing moved for {STALL_S:.0f} s; see {running.log}")
+            if why := _stopped(cell):
+                raise DemoError(f"{why}; see {running.log}")
             with contextlib.suppress(ShardUnreachableError):  # the operator restarts it
                 views, ordered, models = _training(cell)
                 for product in sorted(models - trained):
@@ -244,6 +249,23 @@ def _follow(cell: Cell, running: RobotCell | RunningRobotCell, console: Console)
             time.sleep(LOOK_S)
     seen.figures["seconds"] = round(time.monotonic() - (seen.started_s or moved_s), 1)
     return seen
+
+
+def _stopped(cell: Cell) -> str:
+    """Return why nothing moves any more: the operator is a script, and has stopped; "" if not."""
+    online = cell.world("online")
+    decision, request = View(online, SYSTEM, DECISION), View(online, SYSTEM, REQUEST)
+    notices = View(online, USER, NOTICES)
+    try:
+        now = online.view(decision, request, notices)
+    except ShardUnreachableError:  # the operator restarts it
+        return ""
+    decided, last = now.get(decision), now.get(request)
+    if decided is None or last is None or last.kind != "stop" or decided.by != SCRIPT:
+        return ""
+    told: Mapping[str, Notice] = now.get(notices, {})
+    why = told[last.place].text if last.place in told else last.place
+    return f"the operator's script has stopped the cell: {why}"
 
 
 def _training(cell: Cell) -> tuple[int, int, set[str]]:
@@ -277,7 +299,7 @@ def _online(cell: Cell, running: RobotCell | RunningRobotCell, seen: Seen) -> di
             seen.judged[place] = judged_by(truths[number], by_name[place])
             if found[place].verdict != "ok":
                 _draw(running, seen, f"deviation_{place.replace('/', '_')}.png")
-    if seen.started_s and "cell.png" not in seen.pictures and len(found) >= 2:
+    if seen.started_s and "cell.png" not in seen.pictures and 2 * len(found) >= running.packages:
         _draw(running, seen, "cell.png")
     seen.flags, seen.results = found, now.get(results, {})
     return {place: notice.text for place, notice in now.get(notices, {}).items()}

@@ -8,9 +8,9 @@ from __future__ import annotations
 import dataclasses
 import json
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
-from actors.palletizing.packing_truth import in_words, truth_of
+from actors.palletizing.packing_truth import DENTED, in_words, seen_as
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
     from actors.palletizing.simulation.cell_truth import PackageTruth
     from actors.palletizing.vocabulary import Deviation, Plan, Result
+
+RIGHT: Final = {DENTED: ("ok", "deformed")}
+"""What may be found where the truth is between two verdicts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,10 +32,10 @@ class Row:
         place: Name of its place.
         product: What it is.
         planned: Where it was to stand, mm, tray frame.
-        truth: What physics made of it, in the words of the verdicts.
+        truth: What physics made of it, in the words of the verdicts, or `DENTED`.
         physical: The same in numbers.
         verdict: What was found.
-        correct: Whether that is right.
+        correct: Whether that is right, see `RIGHT`.
         reactions: Kinds of the requests that followed the first one.
         result: What became of it.
         reason: Why.
@@ -58,7 +61,7 @@ def judged_by(package: PackageTruth, plan: Plan) -> tuple[str, str]:
         plan: Where it was to stand.
     """
     planned = plan.tray_from_product
-    return truth_of(package, planned), in_words(package, planned)
+    return seen_as(package, planned), in_words(package, planned)
 
 
 def row_of(
@@ -89,7 +92,7 @@ def row_of(
         truth=then[0] if flag is not None else truth,
         physical=then[1] if flag is not None else physical,
         verdict="-" if flag is None else flag.verdict,
-        correct=flag is None or flag.verdict == then[0],
+        correct=flag is None or flag.verdict in RIGHT.get(then[0], (then[0],)),
         reactions=result.reactions,
         result=result.result,
         reason=result.reason,
@@ -102,7 +105,7 @@ def table_of(rows: Sequence[Row]) -> Table:
 
     table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
     for name in ("package", "planned (mm)", "physics", "verdict", "reactions", "result"):
-        table.add_column(name)
+        table.add_column(name, no_wrap=name in {"package", "planned (mm)", "result"})
     for row in rows:
         colour = "red" if not row.correct else "green" if row.verdict == "ok" else "yellow"
         table.add_row(
@@ -121,9 +124,10 @@ def score_of(rows: Sequence[Row]) -> str:
     judged = [row for row in rows if row.verdict != "-"]
     right = sum(row.correct for row in judged)
     by_robot = sum(row.result == "placed" for row in rows)
+    at_once = sum(row.result == "placed" and not row.reactions for row in rows)
     return (
         f"{right} of {len(judged)} verdicts right; {by_robot} of {len(rows)} packages placed as"
-        f" planned, {sum(bool(row.reactions) for row in rows)} after a reaction or not at all"
+        f" planned, {at_once} of them at the first try"
     )
 
 

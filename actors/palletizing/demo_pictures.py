@@ -71,14 +71,14 @@ def model_picture(name: str, surface: Surface) -> Picture:
         )
         for azimuth in (-60.0, 120.0)
     ]
-    faces = len(surface.patch_planes)
+    faces = f"{len(surface.patch_planes)} plane face{'s' if len(surface.patch_planes) != 1 else ''}"
     size_mm = 1000.0 * np.ptp(surface.vertices_m, axis=0)
     size = " x ".join(f"{side:.0f}" for side in size_mm)
     return tiles(
         pictures,
         [
             f"{name}: trained from depth views",
-            f"{size} mm, {len(surface.triangles)} triangles, {faces} plane faces",
+            f"{size} mm, {len(surface.triangles)} triangles, {faces}",
         ],
     )
 

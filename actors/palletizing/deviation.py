@@ -70,11 +70,19 @@ class DeviationDetection(Actor):
         """Judge one place."""
         plan, observed = lock[self.plan], lock[self.observed]
         model = lock[self.models][product_entity(plan.product)]
+        sightings = lock[self.sightings]
+        beside = [
+            seen.frame_from_package
+            for package, seen in sightings.items()
+            if (seen.frame, seen.tray) == ("tray", plan.tray)
+            and package.name not in observed.packages
+        ]
         found = inspect_place(
-            observed.frame, observed.before_mm, model, plan.tray_from_product, limits=self.limits
-        )
-        new = [name for name in observed.packages if Entity(name) in lock[self.sightings]]
-        poses = [lock[self.sightings][Entity(name)].frame_from_package for name in new]
+            observed.frame, observed.before_mm, model, plan.tray_from_product,
+            limits=self.limits, others=beside,
+        )  # fmt: skip
+        new = [name for name in observed.packages if Entity(name) in sightings]
+        poses = [sightings[Entity(name)].frame_from_package for name in new]
         chosen = nearest(found.tray_from_product[:2, 3], [pose[:2, 3] for pose in poses])
         flag = Deviation(
             package="" if chosen is None or found.verdict == "missing" else new[chosen],

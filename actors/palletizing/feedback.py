@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from actors.palletizing.handling import (
     FELT_SIDE,
@@ -68,6 +68,10 @@ from enact_dist import Actor, Entity, View, ViewEach, World, Write
 
 if TYPE_CHECKING:
     from enact_dist import Lock
+
+
+TAKEN_UP: Final = ("regrasp", "place", "push", "remove")
+"""Stages after which a package need not be where it was seen before."""
 
 
 class Feedback(Actor):
@@ -137,6 +141,8 @@ class HandlingFeedback(Actor):
         last = lock.get(self.request)
         if last is None or last.place in lock.get(self.results, {}):
             self._next(lock, last)
+        elif last.kind == "ask" and self._is_taken_out(lock, last):
+            self._close(lock, last, "removed", TAKEN_OUT)
         elif last.kind in IDLE:
             decision = lock.get(self.decision)
             if decision is not None and decision.request == last.number:
@@ -163,15 +169,27 @@ class HandlingFeedback(Actor):
                 wanted = lock[self.plans][place].product
                 if seen.product == wanted:
                     self._ask_robot(lock, first, "pack", f"{wanted} has come")
+                elif seen.unfit:
+                    self._question(lock, first, seen.unfit, UNFIT_ON_BELT)
                 else:
-                    found = seen.product or "something unknown"
-                    self._question(lock, first, f"{found} has come in place of {wanted}")
+                    self._question(lock, first, f"{seen.product} has come in place of {wanted}")
                 return
         sight = lock.get(self.sight)
-        if sight is not None and sight.number == number and sight.error:
+        if self._is_taken_out(lock, first):
+            self._close(lock, first, "removed", TAKEN_OUT)
+        elif sight is not None and sight.number == number and sight.error:
             self._ask_robot(lock, first, "look", sight.error)
         elif last is not None and last.place == place.name:  # a look for what has come has ended
             self._see_nothing(lock, last, UNRECOGNISED)
+
+    def _is_taken_out(self, lock: Lock, last: Request) -> bool:
+        """Return whether what has come for a place was taken away before it was recognised."""
+        sight = lock.get(self.sight)
+        return (
+            sight is not None
+            and not last.package
+            and (last.place, TAKEN_OUT) == (place_entity(sight.number).name, sight.error)
+        )
 
     def _spoiled(self, lock: Lock) -> list[str]:
         """Return the places that stood as was decided, and have been judged otherwise since."""
@@ -227,7 +245,7 @@ class HandlingFeedback(Actor):
 
     def _answer(self, lock: Lock, last: Request, case: Case, flag: Deviation | None) -> None:
         """Do what follows from how a request ended and from what was seen."""
-        felt_m = last.felt_m + FELT_M.get(case.result, 0.0)
+        felt_m = self._felt_m(lock, last, case.result)
         done = replace(last, tried=(*last.tried, last.kind), felt_m=felt_m)
         case = self._case(lock, done, case, flag)
         reaction = react(case)
@@ -235,6 +253,14 @@ class HandlingFeedback(Actor):
             why = f"it is still seen: {case.seen}" if case.success else case.result
             reaction = Reaction("ask", f"it could not be {GONE[last.kind]}: {why}")
         self._follow(lock, done, case, flag, reaction)
+
+    def _felt_m(self, lock: Lock, last: Request, result: str) -> float:
+        """Return how far beside where it was seen the package is, by all that was felt."""
+        sighting = lock[self.sightings].get(Entity(last.package)) if last.package else None
+        if sighting is None or result not in FELT_SIDE:
+            return last.felt_m
+        grasp = lock[self.grasps].get(product_entity(sighting.product))
+        return last.felt_m if grasp is None else felt_on(last.felt_m, result, grasp)
 
     def _follow(
         self, lock: Lock, done: Request, case: Case, flag: Deviation | None, reaction: Reaction
@@ -245,7 +271,8 @@ class HandlingFeedback(Actor):
         if reaction.kind == "go_on":
             self._close(lock, done, "placed", reaction.reason)
         elif reaction.kind == "ask":
-            self._question(lock, now, reaction.reason, case.verdict)
+            verdict = UNFIT_ON_BELT if case.unfit else case.verdict
+            self._question(lock, now, reaction.reason, verdict)
         else:
             self._ask_robot(lock, now, reaction.kind, reaction.reason)
 
@@ -256,8 +283,10 @@ class HandlingFeedback(Actor):
             plan = lock[self.plans][Entity(last.place)]
             along, across = along_and_across(plan, flag.tray_from_product)
             turn = flag.turn_deg
+        sighting = lock[self.sightings].get(Entity(last.package)) if last.package else None
         return replace(
             case,
+            unfit=sighting.unfit if sighting is not None and case.seen == "belt" else "",
             verdict="" if flag is None else flag.verdict,
             along_mm=along,
             across_mm=across,
@@ -269,9 +298,14 @@ class HandlingFeedback(Actor):
         """Look again, and ask the operator when that was tried often enough."""
         tried = (*last.tried, last.kind)
         now = replace(last, tried=tried)
+        outcome = lock.get(self.outcome)
+        if outcome is not None and outcome.request == last.number and outcome.stage in TAKEN_UP:
+            now = replace(now, seen="")  # where it was taken up the next one may stand
         self._tell(lock, last.place, None, error)
         looks = tried.count("look")
-        if error.startswith(NOT_ASIDE):
+        if error == TAKEN_OUT:
+            self._close(lock, now, "removed", error)
+        elif error.startswith(NOT_ASIDE):
             self._question(lock, now, error)
         elif looks >= MOST["look"]:
             self._question(lock, now, f"{error}; look was tried {looks} times")
@@ -323,7 +357,7 @@ class HandlingFeedback(Actor):
         self._question(lock, now, reason)
         self._tell(lock, last.place, None, f"stop: {reason}")
 
-    # What is told
+    # What the user reads
 
     def _flag(self, lock: Lock, place: str) -> Deviation:
         """Return the last verdict on a place."""

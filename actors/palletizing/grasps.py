@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from actors.palletizing.finger_room import FLAT_M2, LINE_N
 from actors.palletizing.grounding import Grasp, Gripper
 
 if TYPE_CHECKING:
@@ -30,10 +31,8 @@ NARROWEST_SHARE: Final = 1.02
 LEAST_HEIGHT_M: Final = 0.040
 """Of the tool above the product's base: the fingers end 20 mm lower, over whatever it stands on."""
 PUSH_HEIGHT_M: Final = 0.030
-FLAT_M2: Final = 0.0007
-"""A flat contact has at least this area: what the dent of a finger would take."""
-FACE_N, LINE_N = 40.0, 25.0
-"""Of the fingers on flat faces, and on a rim or a round wall, which would give way."""
+FACE_N: Final = 40.0
+"""Of the fingers on flat faces; see `finger_room.LINE_N`."""
 FLAT_RAD: Final = float(np.deg2rad(10.0))
 THICKNESS_M: Final = 0.002
 """What is at most so far inside of the outermost points is touched by a finger."""

@@ -32,7 +32,7 @@ clear_m                 m         height above the others while carrying
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -42,6 +42,7 @@ import numpy.typing as npt
 from actors.geometry.joint_paths import Arm
 from actors.geometry.poses import inverse, roll_pitch_yaw, turned
 from actors.geometry.reaching import reach
+from actors.palletizing import finger_room
 from actors.palletizing.net_files import net_of_document, read_document
 from actors.palletizing.nets import Net, NetError, Primitive
 from actors.palletizing.skeleton_files import bind
@@ -49,6 +50,8 @@ from actors.palletizing.skeleton_files import bind
 F64 = npt.NDArray[np.float64]
 Frames = Callable[[str], F64]
 Value = str | float | F64
+Beside = tuple[tuple[str, F64, F64], ...]
+"""Entity, where it stands, and the box of each other package, see `Job.beside`."""
 
 FOLDER: Final = Path(__file__).parent / "skeletons"
 SKELETONS: Final = tuple(sorted(file.stem for file in FOLDER.glob("*.toml")))
@@ -56,16 +59,14 @@ SKELETONS: Final = tuple(sorted(file.stem for file in FOLDER.glob("*.toml")))
 CLEAR_M: Final = 0.13
 PUSH_GAP_M: Final = 0.02
 PUSH_FORCE_N: Final = 10.0
-PUSH_TRAVEL_M: Final = 0.065
+PUSH_TRAVEL_M: Final = 0.077
 """Beyond what the package stands short of its place."""
-BESIDE_M: Final = 0.022
-"""Between the closed hand and the package before a push."""
+BESIDE_M: Final = 0.034
+"""Between the closed hand and a package before a push; one grasped off its middle stands nearer."""
 OVER_M: Final = 0.003
 """Between the tips and the package before they go down beside it."""
-REGRASP_OPEN_M: Final = 0.014
-"""So much wider than the package the hand opens where others stand, see skeletons/regrasp.toml."""
-FINGER_ROOM_M: Final = 0.002
-"""Between a finger and what stands beside the package, at least."""
+TAKING: Final = ("grasp_from_belt", "regrasp")
+"""Skeletons that take a package with open fingers."""
 SQUEEZE_M: Final = 0.006
 """So much less or more than its width a package between the fingers measures at most."""
 
@@ -146,7 +147,7 @@ class Job:
     turned: bool = False
     gap_m: float = PUSH_GAP_M
     product: str = ""
-    beside: tuple[tuple[str, F64, F64], ...] = ()
+    beside: Beside = ()
 
 
 def ground(
@@ -159,12 +160,14 @@ def ground(
         job: What the action is about.
         arm: Kinematics and ranges; its base is the frame of `frames`.
         gripper: What holds the package.
-        frames: Returns base_from_entity, (4, 4); KeyError if the entity is not known.
+        frames: Returns base_from_entity, (4, 4); KeyError if the entity is not known.  A package
+            that stands so near to the entity "tray" that a finger goes down over its rim is held
+            higher.
         near_rad: (n,), where the arm is.
 
     Raises:
         NetError: One line: a parameter lacks or is ill-typed, the package is too wide, too narrow
-            or too heavy to hold, a finger has no room beside it on the tray, or a pose is out of
+            or too heavy to hold, a finger has no room beside it, or a pose is out of
             the arm's reach.
         OSError: The skeleton cannot be read.
     """
@@ -172,8 +175,9 @@ def ground(
     about = f"{file.stem} for {job.package}"
     _check_grip(about, job, gripper)
     _check_payload(about, job, arm, gripper)
-    if file.stem == "regrasp":
-        _check_room(about, job, gripper, frames)
+    job = _over_low(file.stem, job, gripper, frames)
+    if file.stem in TAKING:
+        _check_room(file.stem, about, job, gripper, frames)
     net = _bound(file, parameters(job, gripper, frames))
     _check_reach(about, net, arm, frames, near_rad)
     return net
@@ -236,12 +240,11 @@ def parameters(job: Job, gripper: Gripper, frames: Frames) -> dict[str, Value]:
         NetError: It is not known where the place is, or the push has no level direction.
     """
     grasp = job.grasp
-    open_m = min(gripper.most_m, grasp.width_m + 3.0 * gripper.play_m)
     values: dict[str, Value] = {
         "package": job.package,
         "grasp.frame": _grasp_frame(grasp),
         "grasp.width_m": grasp.width_m,
-        "grasp.open_m": open_m,
+        "grasp.open_m": finger_room.open_m(grasp, gripper, on_belt=True),
         "grasp.over_m": float(job.size_m[2] - grasp.point[2]) + gripper.tips_m + OVER_M,
         "grasp.height_m": float(grasp.point[2]),
         "grasp.force_n": grasp.force_n,
@@ -334,29 +337,42 @@ def _check_grip(about: str, job: Job, gripper: Gripper) -> None:
         raise NetError(f"{about}: the axis of its grasp {found} is not level")
 
 
-def _check_room(about: str, job: Job, gripper: Gripper, frames: Frames) -> None:
-    """Refuse a grasp on the tray of which a finger would come down on another package."""
+def _over_low(skeleton: str, job: Job, gripper: Gripper, frames: Frames) -> Job:
+    """Return the job with a grasp over what is low beside the package, if that can hold it.
+
+    All stages of a request get the same one, as long as it is not known to be elsewhere.
+    """
+    try:
+        base_from_package = frames(job.package)
+    except KeyError:
+        return job
+    beside, opened_m = _beside(skeleton, job, gripper, frames)
+    base_from_grasp = base_from_package @ _grasp_frame(job.grasp)
+    grasp = finger_room.over_low(job.grasp, job.size_m, base_from_grasp, beside, gripper, opened_m)
+    return replace(job, grasp=grasp)
+
+
+def _check_room(skeleton: str, about: str, job: Job, gripper: Gripper, frames: Frames) -> None:
+    """Refuse a grasp of which a finger would come down on something beside the package."""
+    beside, opened_m = _beside(skeleton, job, gripper, frames)
     base_from_grasp = _known(frames, job.package) @ _grasp_frame(job.grasp)
-    thick_m = gripper.half_m - 0.5 * gripper.least_m
-    finger = 0.5 * thick_m + FINGER_ROOM_M
-    half = np.array([gripper.half_across_m + FINGER_ROOM_M, finger])
-    for side in (-1.0, 1.0):
-        out_m = 0.5 * (job.grasp.width_m + REGRASP_OPEN_M + thick_m)
-        base_from_finger = base_from_grasp.copy()
-        base_from_finger[:3, 3] += side * out_m * base_from_grasp[:3, 1]
-        for entity, base_from_product, size_m in job.beside:
-            if _overlap(base_from_finger, half, base_from_product, 0.5 * size_m[:2]):
-                raise NetError(f"{about}: {entity} leaves no room for a finger beside it")
+    entity = finger_room.in_the_way(base_from_grasp, beside, gripper, opened_m)
+    if entity is not None:
+        raise NetError(f"{about}: {entity} leaves no room for a finger beside it")
 
 
-def _overlap(first: F64, first_half: F64, second: F64, second_half: F64) -> bool:
-    """Return whether two upright boxes overlap seen from above: no level axis parts them."""
-    apart = second[:2, 3] - first[:2, 3]
-    for axis in (*first[:2, :2].T, *second[:2, :2].T):
-        reach = np.abs(axis @ first[:2, :2]) @ first_half
-        if abs(axis @ apart) >= reach + np.abs(axis @ second[:2, :2]) @ second_half:
-            return False
-    return True
+def _beside(skeleton: str, job: Job, gripper: Gripper, frames: Frames) -> tuple[Beside, float]:
+    """Return what stands beside a package, and how wide the hand is open when it takes it."""
+    beside, on_belt = job.beside, skeleton != "regrasp"
+    try:
+        base_from_tray, base_from_package = frames("tray"), frames(job.package)
+    except KeyError:
+        pass
+    else:
+        beside = (*beside, *finger_room.rim_beside(base_from_tray))
+        if skeleton not in TAKING:
+            on_belt = not finger_room.on_tray(base_from_tray, base_from_package)
+    return beside, finger_room.open_m(job.grasp, gripper, on_belt=on_belt)
 
 
 def _check_payload(about: str, job: Job, arm: Arm, gripper: Gripper) -> None:

@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from actors.palletizing.finger_room import open_m
 from actors.palletizing.grounding import PUSH_GAP_M, Gripper, Job, easier_turn, ground
 from actors.palletizing.nets import NetError
 
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from actors.geometry.joint_paths import Arm
-    from actors.palletizing.grounding import Grasp
+    from actors.palletizing.grounding import Beside, Grasp
     from actors.palletizing.nets import Net
     from actors.palletizing.vocabulary import (
         GripCommand,
@@ -59,16 +60,22 @@ SKELETON_OF: Final = {
 }
 STANDS: Final = ("placed", "accepted")
 """Results after which a place is filled."""
-RISKY: Final = ("place", "push")
-"""Stages that can spoil what stands on the tray."""
+RISKY: Final = ("regrasp", "place", "push", "remove")
+"""Stages that can spoil what stands on the tray, or leave something where it shall not be."""
 HELD_M: Final = 0.006
 """A package between the fingers measures at most so much more or less than its width."""
+FELT_SIDE: Final = {"blocked_left": 1.0, "blocked_right": -1.0}
+"""To which side, along the grasp's axis, a package is of where it was seen."""
+FELT_SHARE: Final = 0.9
+"""Of what the open hand has room the next grasp goes farther: two grasps overlap."""
 GONE: Final = {"reject": "rejected", "removed": "removed"}
 """Requests after which the package shall be seen nowhere, and what became of it then."""
 NOT_ASIDE: Final = "the arm is not aside: "
 """What a look at the tray needs, and lacks."""
 UNRECOGNISED: Final = "something is in the light barrier, but no package is recognised there"
 """What follows from looks at the belt, again and again, that show nothing."""
+TAKEN_OUT: Final = "it was taken out of the light barrier: nothing is seen on the belt"
+"""Why what has come is not asked about any more."""
 IDLE: Final = ("stop", "ask")
 """Kinds of requests that move nothing."""
 
@@ -112,11 +119,29 @@ def felt(frame_from_product: F64, grasp: Grasp, felt_m: float) -> F64:
     Args:
         frame_from_product: Where it was seen.
         grasp: Of its product.
-        felt_m: So far along the grasp's axis it is beside that, see `reactions.FELT_M`.
+        felt_m: So far along the grasp's axis it is beside that, see `felt_on`.
     """
     pose = np.array(frame_from_product)
     pose[:3, 3] += felt_m * (pose[:3, :3] @ grasp.axis)
     return pose
+
+
+def felt_on(felt_m: float, result: str, grasp: Grasp, gripper: Gripper | None = None) -> float:
+    """Return how far beside where it was seen a package is, by all fingers that came down on it.
+
+    A finger comes down on a package that is farther off than the hand has room: anything beyond
+    that is as likely the nearer it is, so the next grasp goes nearly one opening farther, and half
+    of it when the fingers have been on both sides.
+
+    Args:
+        felt_m: By those before, metres along the grasp's axis.
+        result: How the last grasp ended.
+        grasp: Of its product.
+        gripper: What came down; the cell's when absent.
+    """
+    step_m = FELT_SHARE * (open_m(grasp, gripper or Gripper(), on_belt=True) - grasp.width_m)
+    side = FELT_SIDE.get(result, 0.0)
+    return felt_m + side * step_m * (0.5 if side * felt_m < 0.0 else 1.0)
 
 
 def gap_before(short_m: float) -> float:
@@ -181,12 +206,12 @@ class Handled:
     Attributes:
         grasp: Of its product.
         size_m: (3,), box of its product.
-        beside: What stands on the tray beside it, see `grounding.Job`.
+        beside: What stands beside it, see `grounding.Job`.
     """
 
     grasp: Grasp
     size_m: F64
-    beside: tuple[tuple[str, F64, F64], ...] = ()
+    beside: Beside = ()
 
 
 class Stages:

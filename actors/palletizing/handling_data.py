@@ -20,10 +20,12 @@ class Arrival:
     Attributes:
         number: How many came before it.
         stamp_ns: When, nanoseconds since 1970.
+        is_gone: It was taken out of the light barrier before it was recognised.
     """
 
     number: int
     stamp_ns: int
+    is_gone: bool = False
 
 
 @dataclass(frozen=True, slots=True)

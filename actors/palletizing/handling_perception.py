@@ -11,26 +11,28 @@ import time
 from collections import Counter
 from typing import TYPE_CHECKING, Any, Final
 
+from actors.geometry.depth import metres
 from actors.geometry.open3d_on_use import open3d
+from actors.geometry.poses import inverse
 from actors.geometry.registration import register
 from actors.geometry.segmentation import new_pieces
-from actors.palletizing.belt_sight import seen_on_belt
-from actors.palletizing.handling import ASIDE, GONE, NOT_ASIDE, UNRECOGNISED, is_held
+from actors.palletizing.belt_sight import BeltWatch
+from actors.palletizing.handling import ASIDE, GONE, NOT_ASIDE, TAKEN_OUT, UNRECOGNISED, is_held
 from actors.palletizing.sensor import FRAMES as FRAMES_FUSED
 from actors.palletizing.sensor import SensorError, Watched, open_sensor
 from actors.palletizing.tray_changes import changed, tray_alone, without
 from actors.palletizing.vocabulary import (
     ARRIVAL,
     BELT,
+    CELL,
     CLOUD,
     COMMAND,
-    CELL,
     CONVEYOR,
     EMPTY,
     EXECUTION,
+    FRAMES,
     GRASP,
     GRIPPER,
-    FRAMES,
     LAST,
     LOOK,
     NET,
@@ -62,7 +64,7 @@ if TYPE_CHECKING:
 
     from actors.geometry.shapes import DepthFrame, Surface
     from actors.palletizing.sensor import TraySensor
-    from actors.palletizing.vocabulary import Outcome, Request
+    from actors.palletizing.vocabulary import Arrival, Outcome, Request
     from enact_dist import Lock
 
     F64 = npt.NDArray[np.float64]
@@ -123,6 +125,7 @@ class HandlingPerception(Actor):
     grasps = ViewEach(training, PRODUCTS, GRASP)
     empty_tray = View(training, TRAY, EMPTY)
     empty_belt = View(training, BELT, EMPTY)
+    cell_frames = View(training, CELL, FRAMES)
     last = Write(online, TRAY, LAST)
     look = Write(online, SYSTEM, LOOK)
     sight = Write(online, CONVEYOR, SIGHT)
@@ -148,7 +151,7 @@ class HandlingPerception(Actor):
         arrival, outcome = lock.get(self.arrival), lock.get(self.outcome)
         went, ended = self._way_aside(lock)
         if arrival is not None and self._looks_for(arrival.stamp_ns, went if ended == ASIDE else 0):
-            self._see_arrival(lock, arrival.number)
+            self._see_arrival(lock, arrival)
         attached = lock.get(self.attached)
         if outcome is None or attached is None or attached.request != outcome.request or not ended:
             return
@@ -188,8 +191,9 @@ class HandlingPerception(Actor):
             self._arrived_ns, self._looked = arrived_ns, aside
         return looks
 
-    def _see_arrival(self, lock: Lock, number: int) -> None:
+    def _see_arrival(self, lock: Lock, arrival: Arrival) -> None:
         """Create the entity of the package that has come, unless it is known."""
+        number = arrival.number
         known = lock[self.sightings].values()
         self._is_unseen = all(seen.first_stop != number for seen in known)
         if not self._is_unseen:
@@ -198,7 +202,9 @@ class HandlingPerception(Actor):
         try:
             self._is_unseen = not self._see_belt(lock, Entity.fresh("package"), number)
             self._unseen[number] += self._is_unseen
-            if self._is_unseen and self._unseen[number] >= UNSEEN_LOOKS:
+            if self._is_unseen and arrival.is_gone:
+                error = TAKEN_OUT
+            elif self._is_unseen and self._unseen[number] >= UNSEEN_LOOKS:
                 error = UNRECOGNISED
         except SensorError as failed:
             error = str(failed)
@@ -224,7 +230,7 @@ class HandlingPerception(Actor):
         missed = not outcome.success and outcome.stage == "grasp"
         on_belt = request.seen == "belt" and request.kind in {"look", "removed"}
         if (missed or on_belt) and self._see_belt(lock, package, before.first_stop):
-            return Look(request.number, "belt", 0)  # later, the next one may lie there
+            return Look(request.number, "belt", 0)
         empty = lock[self.empty_tray]
         frame, now_ns = tray_alone(self.tray_sensor.image(), empty), time.time_ns()
         tray = lock[self.plans][place].tray
@@ -243,6 +249,8 @@ class HandlingPerception(Actor):
             seen = Observation(frame, before_mm, (name,) if there[name] else (), now_ns)
             lock[self.observations].put(Entity(at), seen, stamp_ns=now_ns)
         lock[self.last] = frame
+        if not there[package.name] and not outcome.success and self._is_newest(lock, before):
+            self._see_belt(lock, package, before.first_stop)  # it was lost on its way
         return Look(request.number, lock[self.sightings][package].frame, now_ns, places)
 
     def _without(self, lock: Lock, name: str, tray: int, frame: DepthFrame) -> Depth:
@@ -262,18 +270,25 @@ class HandlingPerception(Actor):
             if seen.frame == "tray" and seen.tray == tray
         }
 
+    def _is_newest(self, lock: Lock, seen: Sighting) -> bool:
+        """Return whether no package has come after one: later, the next one may lie there."""
+        arrival = lock.get(self.arrival)
+        return arrival is None or arrival.number == seen.first_stop
+
     def _see_belt(self, lock: Lock, package: Entity, number: int) -> bool:
         """Look for a package on the belt; return whether there is one."""
-        frame = self.belt_sensor.image(number)
-        models = self._models(lock)
-        sights = seen_on_belt(frame, lock[self.empty_belt].depth_mm, models)
-        if not sights:
+        before, frames = lock[self.sightings].get(package), lock.get(self.cell_frames)
+        between = None if frames is None else inverse(frames["belt"]) @ frames["tray"]
+        watch = BeltWatch(lock[self.empty_belt], self._models(lock), between)
+        product = "" if before is None else before.product
+        sight = watch.sight(self.belt_sensor.image(number), product)
+        if sight is None:
             return False
-        sight, place = sights[0], Entity(f"place/{number}")
+        place = Entity(f"place/{number}")
         tray = lock[self.plans][place].tray if place in lock[self.plans] else 0
-        product = sight.product if sight.known else ""
+        product = sight.product if sight.known else product
         lock[self.sightings][package] = Sighting(
-            tray, sight.belt_from_product, number, number, "belt", product
+            tray, sight.belt_from_product, number, number, "belt", product, sight.unfit
         )
         return True
 
@@ -291,7 +306,10 @@ class HandlingPerception(Actor):
         ]
         if pieces:
             surface = lock[self.models][product_entity(seen.product)]
-            found = register(pieces[0].cloud, pieces[0].outline_m, surface, plan.tray_from_product)
+            found = register(
+                pieces[0].cloud, pieces[0].outline_m, surface, plan.tray_from_product,
+                seen_by=frame.acquisition, before_m=metres(before_mm),
+            )  # fmt: skip
             lock[self.clouds][package] = pieces[0].cloud
             where, pose = "tray", found.tray_from_product
         else:

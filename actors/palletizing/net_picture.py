@@ -16,9 +16,9 @@ from actors.palletizing.nets import AXES, TOOLS, unit_of
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from actors.palletizing.nets import Execution, Net, Primitive
+    from actors.palletizing.nets import Execution, Net
 
-WIDTH: Final = 250.0
+WIDTH: Final = 270.0
 HEIGHT: Final = 54.0
 ROW: Final = 112.0
 """From one row to the next, pixels; lines carry two rows of text between them."""
@@ -228,12 +228,14 @@ def _state(
     seconds = f"  {took[name]:.2f} s" if name in took else ""
     ended = f"  {result or 'runs'}" if stopped else ""
     yield _text(f"{name}{seconds}{ended}", place.x + 10.0, place.y + 17.0, "title")
-    for row, text in enumerate(_notes(net.primitives[name])):
+    for row, text in enumerate(_notes(net, name)):
         yield _text(text, place.x + 10.0, place.y + 32.0 + 13.0 * row, "note")
 
 
-def _notes(primitive: Primitive) -> Iterator[str]:
-    """Return what a primitive does, in two lines."""
+def _notes(net: Net, name: str) -> Iterator[str]:
+    """Return what a primitive does, in two lines; which entity it is about, by its parameter."""
+    primitive, entity = net.primitives[name], net.primitives[name].frame.entity
+    parameters = {bound: parameter for parameter, bound in net.grounded.items()}
     held = {
         n: axis for n, axis in zip(AXES, primitive.axes, strict=True) if axis.mode == "position"
     }
@@ -250,11 +252,14 @@ def _notes(primitive: Primitive) -> Iterator[str]:
     if primitive.tool != "keep":
         tool = f", {primitive.tool} {primitive.tool_value:.4g} {TOOLS[primitive.tool]}"
     tare = ", tare" if primitive.tare else ""
-    yield f"{primitive.frame.entity}, {primitive.limit_s:g} s at most{tool}{tare}"
+    yield f"{parameters.get(entity, entity)}, {primitive.limit_s:g} s at most{tool}{tare}"
 
 
 def _heading(net: Net, run: Execution | None) -> str:
-    bound = ", ".join(f"{name} {entity}" for name, entity in net.grounded.items())
+    bound = ", ".join(
+        entity if entity.partition("/")[0] == name else f"{name} {entity}"
+        for name, entity in net.grounded.items()
+    )
     result = "" if run is None else f": {run.result or 'it runs'}"
     return f"{net.name}{f' ({bound})' if bound else ''}{result}"
 

@@ -6,7 +6,7 @@ import queue
 import sys
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
 from actors.palletizing.controller import open_controller
 from actors.palletizing.vocabulary import (
@@ -26,6 +26,13 @@ if TYPE_CHECKING:
     from enact_dist import Lock
 
 
+SCRIPT: Final = "script"
+"""Who has decided, where no person has."""
+LOOKS: Final = 6
+"""A script lets the cell look so often for one place, those by itself included: whatever hides the
+package needs a person."""
+
+
 class Hands(Protocol):
     """A person's hands, where a simulated cell has none."""
 
@@ -43,8 +50,9 @@ class Operator(Actor):
 
     Args:
         answers: Words in the order of preference, such as "reject removed", or a file with them:
-            of a question's choices the first of these is taken, or else the first choice.  Empty:
-            a person is asked at the terminal of this process.
+            of a question's choices the first of these is taken, or else the first choice.  In
+            place of another look it stops when the cell has looked `LOOKS` times for a place.
+            Empty: a person is asked at the terminal of this process.
         hands: Address of what removes a package for the answer "removed", see `Hands`; empty: the
             person does so before answering.
     """
@@ -75,18 +83,25 @@ class Operator(Actor):
             self._asked = question.request
             while self._lines is not None and not self._lines.empty():
                 self._lines.get_nowait()  # typed before this question was asked
-        choice = self._scripted(question) if self.answers else self._typed(question)
+        if self.answers:
+            choice, why = self._scripted(question, lock[self.request].tried.count("look"))
+        else:
+            choice, why = self._typed(question), ""
         if not choice:
             return
         if choice == "removed" and self.hands is not None:
             self._remove(lock)
-        print(f"  {choice}", flush=True)
-        by = "script" if self.answers else "terminal"
+        print(f"  {choice}{why}", flush=True)
+        by = SCRIPT if self.answers else "terminal"
         lock[self.decision] = Decision(question.request, choice, by)
 
-    def _scripted(self, question: Question) -> str:
+    def _scripted(self, question: Question, looks: int) -> tuple[str, str]:
+        """Return the answer of the script, and why, if it is none of its own."""
         wanted = (word for word in self.answers if word in question.choices)
-        return next(wanted, question.choices[0])
+        choice = next(wanted, question.choices[0])
+        if choice == "look" and looks >= LOOKS and "stop" in question.choices:
+            return "stop", f": after {looks} looks the script looks no more"
+        return choice, ""
 
     def _typed(self, question: Question) -> str:
         """Return what was typed, if it is a choice; never wait for it, since the lock would."""

@@ -7,8 +7,7 @@ It does what the actors do, with the same functions, as fast as it goes: a packa
 sensor sees it, nets are grounded and executed, the hand goes aside, the tray sensor looks, every
 place whose neighbourhood has changed is judged, and what was seen decides what follows.
 
-Two things differ.  A package that is lost on its way to the tray and lies on the belt is tried
-again, where the actors ask the operator.  The operator is a rule.
+One thing differs: the operator is a rule.
 
 Rules a change must keep: decisions see pictures and measurements only, never the truth of physics;
 truth is noted beside each verdict, for the score (`packing_scores`).
@@ -23,16 +22,16 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from actors.geometry.depth import fused
-from actors.geometry.poses import coordinates
-from actors.palletizing.belt_sight import seen_on_belt
+from actors.geometry.poses import coordinates, inverse
+from actors.palletizing.belt_sight import BeltWatch
 from actors.palletizing.execution import Executor
 from actors.palletizing.grasps import grasp_of, size_of
 from actors.palletizing.grounding import Gripper, Job, aside_net, easier_turn, ground
-from actors.palletizing.handling import felt, fills, gap_before
+from actors.palletizing.handling import felt, felt_on, fills, gap_before
 from actors.palletizing.nets import NetError
 from actors.palletizing.packing_records import Judgement, Packed, Step
 from actors.palletizing.packing_truth import KINDS, badness, gap_m, state_of, top_dent_mm, truth_of
-from actors.palletizing.reactions import FELT_M, NO_NET, Case, Reaction, react, worst
+from actors.palletizing.reactions import NO_NET, Case, Reaction, react, worst
 from actors.palletizing.rows import contacts_between, planned_rows
 from actors.palletizing.sensor import FRAMES
 from actors.palletizing.simulation.cell_scene import ARM, HOME_RAD, CellLayout
@@ -48,6 +47,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from actors.geometry.shapes import DepthFrame, Surface
+    from actors.palletizing.belt_sight import BeltSight
     from actors.palletizing.nets import Net
     from actors.palletizing.rows import Slot
     from actors.palletizing.simulation.cell_truth import PackageTruth
@@ -108,7 +108,7 @@ class Packing:
         self._put, self._gone, self._by_hand = set[int](), set[int](), set[int]()
         self.layout, self._told = layout or CellLayout(), told
         self.cell = PhysicalCell(packages, seed=seed, layout=self.layout)
-        self._packages, self._models = tuple(packages), models
+        self._packages = tuple(packages)
         self._sizes = {name: size_of(model) for name, model in models.items()}
         self._grasps = {
             name: grasp_of(model, mass_kg=MATERIALS[name].mass_kg) for name, model in models.items()
@@ -124,13 +124,18 @@ class Packing:
         self.watch = TrayWatch(tray.capture_empty(), models)
         self._tray = tray
         self._pictures: list[DepthFrame] = []
-        self._belt_empty_mm = self._belt.capture_empty().depth_mm
-        self._frames = {"belt": self.layout.base_from_belt, "bin": self.layout.base_from_bin}
+        belt_from_tray = inverse(self.layout.base_from_belt) @ self.layout.base_from_tray
+        self._belt_watch = BeltWatch(self._belt.capture_empty(), models, belt_from_tray)
+        self._frames = {
+            "belt": self.layout.base_from_belt,
+            "bin": self.layout.base_from_bin,
+            "tray": self.layout.base_from_tray,
+        }
         self._set_places()
         self._last_rad: F64 | None = None
         self._turned, self._felt_m, self._drop_at_s = False, 0.0, inf
         self._flagged = dict[int, str]()
-        self._belt_seen, self._arrived_cycles = True, 0
+        self._belt_seen, self._arrived_cycles, self._on_belt = True, 0, np.eye(4)
         self.cell.arm.start()
 
     def run(self) -> list[Packed]:
@@ -196,7 +201,7 @@ class Packing:
             again = choice if choice in STAGES else reaction.kind
             request = again if again in STAGES else ""
             short_mm = max(0.0, -case.along_mm)
-            self._felt_m += FELT_M.get(case.result, 0.0)
+            self._felt_m = felt_on(self._felt_m, case.result, self._grasps[packed.product])
             if request:
                 tried[request] = tried.get(request, 0) + 1
         if packed.rejected:
@@ -241,10 +246,11 @@ class Packing:
     ) -> tuple[list[tuple[str, str]], Case]:
         """Run the nets of a request; return their results, and how the last one ended."""
         stages: list[tuple[str, str]] = []
-        if request == "retry":
-            self._look_at_belt()
-        if request in {"pack", "retry"} and not self._see_on_belt(number):
+        if request == "pack" and not self._comes(number):
             return stages, Case("grasp_from_belt", "not_seen", success=False)
+        if request in {"pack", "retry"}:
+            grasp = self._grasps[self._packages[number].product]
+            self._frames[f"package/{number}"] = felt(self._on_belt, grasp, self._felt_m)
         job = self._job(number)
         if request == "push_again":
             job = replace(job, gap_m=gap_before(short_mm / 1e3))
@@ -283,8 +289,8 @@ class Packing:
             product=product,
             beside=tuple(
                 (entity, self._frames[entity], self._sizes[self._packages[other].product])
-                for other, verdict in self._flagged.items()
-                if other != number and verdict != "missing"
+                for other, seen in self.watch.seen.items()
+                if other not in {number, *self._gone} and seen.pose is not None
                 for entity in [f"package/{other}"]
             ),
         )
@@ -342,32 +348,38 @@ class Packing:
     def _feed(self) -> None:
         self.cell.feed()
         self.cell.run_belt()
-        self._look_at_belt()
+        self._pictures, self._belt_seen, self._arrived_cycles = [], False, 0
 
     def _feed_after(self, number: int) -> None:
         """Let the package after this one come, unless it has."""
-        if self.cell.coming == len(self._packages) - number - 1 > 0:
+        if self._is_newest(number) and self.cell.coming:
             self._feed()
 
-    def _look_at_belt(self) -> None:
-        """Take new pictures of the belt when a package stands there."""
-        self._pictures, self._belt_seen, self._arrived_cycles = [], False, 0
+    def _is_newest(self, number: int) -> bool:
+        """Return whether no package has come after one: later, the next one may lie there."""
+        return self.cell.coming == len(self._packages) - number - 1
 
-    def _see_on_belt(self, number: int) -> bool:
-        """Wait until a package stands in the light barrier and look; return whether one is seen."""
+    def _comes(self, number: int) -> bool:
+        """Wait until a package stands in the light barrier; return whether it is the right one."""
         until_s = self.cell.time_s + WAIT_S
         while not self._belt_seen and self.cell.time_s < until_s:
             self._rest()
-        if not self._belt_seen:
-            return False
-        sights = seen_on_belt(fused(self._pictures), self._belt_empty_mm, self._models)
-        for sight in sights:
-            if sight.product == self._packages[number].product and sight.known:
-                pose = self.layout.base_from_belt @ sight.belt_from_product
-                grasp = self._grasps[sight.product]
-                self._frames[f"package/{number}"] = felt(pose, grasp, self._felt_m)
-                return True
-        return False
+        sight = self._sight(number, self._pictures) if self._belt_seen else None
+        return sight is not None and sight.known
+
+    def _look_at_belt(self, number: int) -> BeltSight | None:
+        """Take new pictures of the belt; return what may be this package, None if nothing is."""
+        pictures = []
+        for _ in range(FRAMES):
+            self._rest(FRAME_CYCLES)
+            pictures.append(self._belt.capture(number))
+        return self._sight(number, pictures)
+
+    def _sight(self, number: int, pictures: Sequence[DepthFrame]) -> BeltSight | None:
+        sight = self._belt_watch.sight(fused(pictures), self._packages[number].product)
+        if sight is not None and sight.known:
+            self._on_belt = self.layout.base_from_belt @ sight.belt_from_product
+        return sight
 
     def _look(self, number: int, all_packed: Sequence[Packed]) -> Seen:
         """Look at the tray, judge each place whose neighbourhood has changed; return this one's."""
@@ -399,8 +411,10 @@ class Packing:
         width_m = self.cell.arm.measured().width_m
         held = self.cell.arm.gripping and fills(width_m, grasp)
         where = "hand" if held else "tray" if seen.verdict != "missing" else ""
-        if not where and self.cell.arrived():
-            where = "belt"
+        unfit = ""
+        if not where and self._is_newest(number):
+            sight = self._look_at_belt(number)
+            where, unfit = ("", "") if sight is None else ("belt", sight.unfit)
         slot = self.slots[number]
         along = across = 0.0
         if seen.pose is not None:
@@ -410,7 +424,7 @@ class Packing:
             across = float(push[0] * off_mm[1] - push[1] * off_mm[0])
         return replace(
             case, verdict=seen.verdict, along_mm=along, across_mm=across, turn_deg=seen.turn_deg,
-            seen=where, tried=dict(tried),
+            seen=where, tried=dict(tried), unfit=unfit,
         )  # fmt: skip
 
     # The operator

@@ -26,7 +26,8 @@ from actors.palletizing.evaluation import train
 from actors.palletizing.packing import Packing
 from actors.palletizing.packing_pictures import Strips
 from actors.palletizing.packing_records import line_of, packed_of
-from actors.palletizing.packing_truth import KINDS, badness
+from actors.palletizing.packing_truth import DENTED, KINDS, SOUND_MM, badness
+from actors.palletizing.reactions import NO_NET
 from actors.palletizing.simulation.knocks import draw_knocks
 from actors.palletizing.simulation.packages import DEMO_PRODUCTS
 from actors.palletizing.simulation.physical_packages import Spread, draw_packages
@@ -51,11 +52,6 @@ GENTLE_MM: Final = 2.0
 """Up to that sigma the robot may damage nothing."""
 DAMAGE_MM: Final = 1.0
 """Depth of a dent from which a package counts as damaged."""
-SOUND_MM: Final = 1.5
-"""A place with a deeper dent is not sound, though physics counts dents from 4 mm as deformed and
-perception has to find those from 3 mm: whether such a dent is flagged is counted apart."""
-DENTED: Final = "dented"
-"""Row of these in the table."""
 RECOVERIES: Final = ("retry", "regrasp", "push_again")
 NOTED: Final = "trays.jsonl"
 """File with a line of JSON per packed tray."""
@@ -80,6 +76,7 @@ GOALS: Final = {
     "flagged_share": Goal("deviations that were flagged, as whatever kind, share", low=0.99),
     "provoked": Goal("packages that an error was provoked of"),
     "recoveries": Goal("recoveries tried"),
+    "refused": Goal("recoveries that the robot refused before it moved"),
     "recovered_share": Goal("recoveries that worked, share", low=0.9),
     "worsened": Goal("recoveries that made it worse, the operator not asked", 0, 0),
     "noticed_by_net": Goal("failures that the net noticed before the camera"),
@@ -350,15 +347,27 @@ def _recoveries(packages: Sequence[Packed]) -> dict[str, float | None]:
     steps = [step for each in packages for step in each.steps]
     knocked = [_knocked(each) for each in packages if each.knock]
     # A knock right after a package was put down is not held against the request that put it there.
-    tried = [step for step in steps if step.request in RECOVERIES and step not in knocked]
+    asked = [step for step in steps if step.request in RECOVERIES and step not in knocked]
+    tried = [step for step in asked if not _is_refused(step)]
     worse = [s for s in tried if s.harmed or badness(s.after) > badness(s.before)]
-    noticed = [step for step in steps if step.stages and not step.succeeded]
+    noticed = [s for s in steps if s.stages and not (s.succeeded or _has_no_net(s.stages[-1]))]
     return {
         "recoveries": float(len(tried)),
+        "refused": float(len(asked) - len(tried)),
         "recovered_share": _share(step.after == "ok" for step in tried),
         "worsened": float(len(worse)) if tried else None,
         "noticed_by_net": float(len(noticed)),
     }
+
+
+def _is_refused(step: Step) -> bool:
+    """Return whether no net ran: nothing was recognised, or none could be grounded."""
+    return all(map(_has_no_net, step.stages))
+
+
+def _has_no_net(stage: tuple[str, str]) -> bool:
+    """Return whether no net could be grounded for a stage."""
+    return stage[1].startswith(NO_NET)
 
 
 def _knocked(packed: Packed) -> Step | None:

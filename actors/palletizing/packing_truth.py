@@ -26,6 +26,11 @@ MOVED_MM: Final = 10.0
 TURNED_DEG: Final = 5.0
 DENTED_MM: Final = 4.0
 """A sound package is off, turned and dented by less."""
+SOUND_MM: Final = 1.5
+"""A place with a deeper dent is not sound, though physics counts dents from 4 mm as deformed and
+perception has to find those from 3 mm: scores count such a dent apart."""
+DENTED: Final = "dented"
+"""What such a place is called."""
 WORSE: Final = {"ok": 0, "belt": 1, "held": 1, "moved": 1, "bin": 2}
 """How bad a state is; all others are worse."""
 ROW_M: Final = 0.05
@@ -44,11 +49,21 @@ def truth_of(truth: PackageTruth, planned: F64) -> str:
     return "deformed" if top_dent_mm(truth) >= DENTED_MM else "ok"
 
 
+def seen_as(truth: PackageTruth, planned: F64) -> str:
+    """Return the same as `truth_of`, and `DENTED` for a dent between sound and deformed."""
+    kind = truth_of(truth, planned)
+    return DENTED if kind == "ok" and top_dent_mm(truth) >= SOUND_MM else kind
+
+
 def state_of(truth: PackageTruth, planned: F64) -> str:
-    """Return what is the matter with a package, or where it is while it is not on the tray."""
-    if truth.where == "tray":
-        return truth_of(truth, planned)
-    return "deformed" if top_dent_mm(truth) >= DENTED_MM else truth.where
+    """Return the worst that is the matter with a package; where it is while it is not on the tray.
+
+    A dent that stays when a package is moved was there before.
+    """
+    kind = truth_of(truth, planned) if truth.where == "tray" else truth.where
+    if kind not in {"moved", truth.where}:
+        return kind
+    return "deformed" if top_dent_mm(truth) >= DENTED_MM else kind
 
 
 def badness(state: str) -> int:

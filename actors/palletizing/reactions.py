@@ -4,10 +4,11 @@
 what happened                  what follows
 =============================  =====================================================================
 sound                          go on
-missed, lost, blocked          retry when it is seen on the belt, regrasp when upright on the tray
+missed, lost, blocked          retry when it stands on the belt, regrasp when upright on the tray
+lies or leans on the belt      ask the operator: no hand takes it
 blocked, no floor, in hand     reject: it is still held
-moved, short of its neighbour  push again, once, up to `SHORT_MM`
-moved up to `NEAR_MM`          regrasp, once more after a push
+moved, short of its neighbour  push again, once, up to `SHORT_MM`, if it is in its row
+moved up to `NEAR_MM`          regrasp, also up to `SHORT_MM` short of its neighbour
 moved farther, tipped,         ask the operator
 deformed, extra
 anything a second or third     ask the operator
@@ -38,10 +39,9 @@ CANNOT: Final = "it cannot be done:"
 NEAR_MM: Final = 30.0
 """A package that stands farther from its place has not just slipped."""
 SHORT_MM: Final = 70.0
-"""Within its row it may stand farther off for a push to bring it there."""
-FELT_M: Final = {"blocked_left": 0.010, "blocked_right": -0.010}
-"""Where a package is that a finger came down on: so far beside where it was seen, along the grasp's
-axis."""
+"""Within its row it may stand farther off."""
+ACROSS_MM: Final = 8.0
+"""A push leaves a package as far beside its row as it is: what stands farther off is taken anew."""
 TURNED_DEG: Final = 20.0
 """A package that is turned by more is nothing that the robot may take by itself."""
 MOST: Final = {"push_again": 1, "regrasp": 2, "retry": 2, "reject": 1, "look": 2}
@@ -56,11 +56,13 @@ CHOICES: Final = {
 }
 """What an operator may let the robot do with a package, by where it is."""
 UNFIT: Final = {
-    "tipped": ("regrasp", "reject"),
+    "tipped": ("regrasp", "retry", "reject"),
     "deformed": ("regrasp",),
     "extra": ("regrasp",),
 }
 """What the robot cannot do with a package, by how it stands."""
+UNFIT_ON_BELT: Final = "tipped"
+"""What a package on the belt is that lies or leans there, for `choices_of`."""
 AGAIN: Final = {"reject": 1, "retry": 3, "regrasp": 3, "removed": 3}
 """How often each is done for one place at most, by the operator or by rule."""
 
@@ -80,6 +82,7 @@ class Case:
         turn_deg: Turn against its place.
         seen: Where the package was seen last: "belt", "tray", "hand", or "" if nowhere.
         tried: How often each reaction was tried for this place.
+        unfit: Why no hand takes it from the belt where it is seen there; empty if one does.
     """
 
     stage: str
@@ -91,6 +94,7 @@ class Case:
     turn_deg: float = 0.0
     seen: str = ""
     tried: Mapping[str, int] = field(default_factory=dict)
+    unfit: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,8 +125,8 @@ def react(case: Case) -> Reaction:
     if case.verdict == "moved":
         return _moved(case)
     what = case.result if not case.success else "not at its place"
-    if what == "not_seen" and case.tried.get("retry"):
-        return Reaction("ask", f"{case.stage}: it is not recognised on the belt")
+    if case.seen == "belt" and case.unfit:
+        return Reaction("ask", f"{case.stage}: {what}; {case.unfit}")
     if case.seen == "belt":
         return _if_left(case, "retry", f"{case.stage}: {what}; it is on the belt")
     if case.seen == "tray":
@@ -165,9 +169,10 @@ def _moved(case: Case) -> Reaction:
     where = f"{case.along_mm:+.0f} mm along the push, {case.across_mm:+.0f} mm across"
     if abs(case.turn_deg) > TURNED_DEG:
         return Reaction("ask", f"it is turned by {case.turn_deg:.0f}°")
-    short = -SHORT_MM < case.along_mm < -abs(case.across_mm) and abs(case.across_mm) < NEAR_MM
-    if not short and max(abs(case.along_mm), abs(case.across_mm)) > NEAR_MM:
+    near = -SHORT_MM < case.along_mm < NEAR_MM and abs(case.across_mm) < NEAR_MM
+    if not near:
         return Reaction("ask", f"{where}: too far away to be taken for a slip")
+    short = case.along_mm < -abs(case.across_mm) and abs(case.across_mm) < ACROSS_MM
     if short and case.tried.get("push_again", 0) < MOST["push_again"]:
         return Reaction("push_again", f"{where}: short of its neighbour")
     return _if_left(case, "regrasp", where)

@@ -42,6 +42,8 @@ WIDTH_MAX_M: Final = 0.125
 """No wider may a package be across its row."""
 RIM_M: Final = 0.030
 """Height of the tray's rim."""
+TRAY_HALF_M: Final = (0.455, 0.325)
+"""Half of the tray with its rim."""
 APART_M: Final = 0.020
 """Between neighbours that are not pushed: where they are put down is not better known."""
 BESIDE_M: Final = 0.005

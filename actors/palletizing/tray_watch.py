@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from actors.geometry.deviation import Limits, inspect_place
-from actors.palletizing.tray_changes import changed, tray_alone, without
+from actors.palletizing.tray_changes import changed, tray_alone, where_seen, without
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -94,15 +94,12 @@ class TrayWatch:
 
     def _inspected(self, place: int, places: Places) -> Seen:
         product, planned = places[place]
-        others = [
-            (self._models[places[number][0]], seen.pose)
-            for number, seen in self.seen.items()
-            if number != place and number in places and seen.pose is not None
-        ]
+        others = self._others(place, places)
         before_mm = without(self.frame, self._empty.depth_mm, others)
         found = inspect_place(
-            self.frame, before_mm, self._models[product], planned, limits=self._limits
-        )
+            self.frame, before_mm, self._models[product], planned,
+            limits=self._limits, others=[pose for _, pose in others],
+        )  # fmt: skip
         return Seen(
             verdict=found.verdict,
             pose=None if found.verdict == "missing" else found.tray_from_product,
@@ -110,6 +107,17 @@ class TrayWatch:
             turn_deg=found.turn_deg,
             deviation_mm=found.deviation_mm,
         )
+
+    def _others(self, place: int, places: Places) -> list[tuple[Surface, F64]]:
+        """Return what stands at the other places: where it was found, or as planned by now."""
+        others = []
+        for number, seen in self.seen.items():
+            if number != place and number in places and seen.pose is not None:
+                product, planned = places[number]
+                surface = self._models[product]
+                pose = where_seen(self.frame, surface, [seen.pose, planned])
+                others.append((surface, seen.pose if pose is None else pose))
+        return others
 
     def _changed(self, places: Places) -> set[int]:
         """Return the places whose pixels differ from those of the picture before."""

@@ -132,6 +132,7 @@ class Sighting:
         last_stop: Stop or arrival at which it was seen last.
         frame: "tray" or "belt"; "" when it has left the cell.
         product: What it was recognised as; empty: nothing was looked for.
+        unfit: Why no hand takes it from the belt, in words: it lies, or leans; empty if one does.
     """
 
     tray: int
@@ -140,6 +141,7 @@ class Sighting:
     last_stop: int
     frame: str = "tray"
     product: str = ""
+    unfit: str = ""
 
 
 @dataclass(frozen=True, slots=True)

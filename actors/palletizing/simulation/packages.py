@@ -254,6 +254,9 @@ def seen_spot(
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Return a point of a package that the overhead sensor sees, all of them equally likely.
 
+    Where a dent would not reach, as in the inner side of a rim, whose outer side gives way in its
+    place, there is none.
+
     Args:
         mesh: Vertices in the product frame, triangles.
         tray_from_product: Where it stands, (4, 4).
@@ -274,8 +277,11 @@ def seen_spot(
     hit = ray_scene(vertices, triangles).cast_rays(tensor(lines, np.float32))["t_hit"].numpy()
     seen = (facing > FACING_COS) & ((a + b + c)[:, 2] > 3.0 * FOOT_M)
     seen &= np.abs(hit - 1.0) < 1e-3
-    chosen = int(random.choice(len(triangles), p=seen * area / (seen * area).sum()))
-    return (a + b + c)[chosen] / 3.0, -normals[chosen]
+    while True:
+        chosen = int(random.choice(len(triangles), p=seen * area / (seen * area).sum()))
+        spot, inwards = (a + b + c)[chosen] / 3.0, -normals[chosen]
+        if _yields(vertices, spot[None], inwards)[0] == 1.0:
+            return spot, inwards
 
 
 def pressed(
@@ -295,14 +301,23 @@ def pressed(
         depth_m: How deep; negative for a bulge.
         sigma_m: Radius of the dent, one sigma.
     """
-    outwards = -(vertices_m @ inwards)
-    relative = (outwards - outwards.min()) / max(float(np.ptp(outwards)), 1e-9)
     beside = vertices_m - at_m
     distance2 = (beside**2).sum(axis=1) - (beside @ inwards) ** 2
     depth = depth_m * np.exp(-distance2 / (2.0 * sigma_m**2))
     return np.asarray(
-        vertices_m + (depth * np.clip((relative - 0.3) / 0.4, 0.0, 1.0))[:, None] * inwards
+        vertices_m + (depth * _yields(vertices_m, vertices_m, inwards))[:, None] * inwards
     )
+
+
+def _yields(
+    vertices_m: npt.NDArray[np.float64],
+    points_m: npt.NDArray[np.float64],
+    inwards: npt.NDArray[np.float64],
+) -> npt.NDArray[np.float64]:
+    """Return what share of a dent each point follows, (N,): 1 outside, 0 on the opposite side."""
+    outwards = -(vertices_m @ inwards)
+    relative = (-(points_m @ inwards) - outwards.min()) / max(float(np.ptp(outwards)), 1e-9)
+    return np.asarray(np.clip((relative - 0.3) / 0.4, 0.0, 1.0))
 
 
 def _draw_truth(random: np.random.Generator) -> Truth:

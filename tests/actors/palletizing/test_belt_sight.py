@@ -7,13 +7,13 @@ pytest.importorskip("open3d", exc_type=ImportError)
 pytest.importorskip("mujoco", exc_type=ImportError)
 
 from actors.geometry.depth import fused, metres
-from actors.geometry.poses import on_tray, yaw_between, yaw_of
+from actors.geometry.poses import inverse, on_tray, turned, yaw_between, yaw_of
 from actors.geometry.shapes import VGA, Acquisition, DepthFrame
-from actors.palletizing.belt_sight import MISFIT_MAX_M, seen_on_belt
+from actors.palletizing.belt_sight import MISFIT_MAX_M, BeltWatch, seen_on_belt
 from actors.palletizing.sensor import steady
 from actors.palletizing.simulation.physical_sensors import PhysicalBeltSensor
 from actors.palletizing.simulation.physics import PhysicalCell
-from actors.palletizing.simulation.products import PRODUCTS
+from actors.palletizing.simulation.products import PRODUCTS, product_mesh
 
 from .moves import carton
 
@@ -109,17 +109,57 @@ def test_what_was_not_trained_is_a_misfit(models):
     assert not belt.seen({})[0].known
 
 
-def test_package_on_its_side_is_a_misfit(models):
-    """A cup that lies is not taken for one that stands."""
-    belt = Belt("yoghurt_cup")
-    lying = on_tray(-0.1, 0.0, 0.3) @ np.array(
-        [[0.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0475], [0, 0, 0, 1.0]]
-    )
-    belt.cell.put(0, belt.cell.layout.base_from_belt @ lying)
+@pytest.mark.parametrize(
+    ("product", "roll_deg", "unfit"),
+    [
+        ("yoghurt_cup", 90.0, "the package lies on its side on the belt"),
+        ("milk_carton", 90.0, "the package lies on its side on the belt"),
+        ("milk_carton", 15.0, "the package leans on the belt by 15°"),
+    ],
+)
+def test_how_a_package_lies_is_recognised(models, product, roll_deg, unfit):
+    """It is not taken for one that stands, and what is the matter with it is known by name."""
+    belt = Belt(product)
+    pose = np.eye(4)
+    pose[:3, :3] = turned(np.deg2rad(roll_deg), 0.0, 0.3)
+    pose[:3, 3] = -0.1, 0.0, -float((product_mesh(product)[0] @ pose[2, :3]).min())
+    belt.cell.put(0, belt.cell.layout.base_from_belt @ pose)
 
     (sight,) = belt.seen(models)
 
     assert not sight.known
+    assert sight.product == product
+    assert np.rad2deg(sight.tilt_rad) == pytest.approx(roll_deg, abs=2.0)
+    assert sight.unfit.replace("14°", "15°").replace("16°", "15°") == unfit
+
+
+def test_what_no_model_explains_is_said_so(models):
+    """A cup on its head shows its foot, which no sensor saw in training."""
+    belt = Belt("yoghurt_cup")
+    head = on_tray(-0.1, 0.0, 0.0) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    head[2, 3] = 0.102
+    belt.cell.put(0, belt.cell.layout.base_from_belt @ head)
+
+    (sight,) = belt.seen(models)
+
+    assert sight.unfit == "what is on the belt is no package that stands upright"
+
+
+def test_a_package_that_stands_over_the_edge_of_the_belt_is_seen(models):
+    """Half of it is over the gap to the tray, and a carton on the tray is right behind it."""
+    belt = Belt("milk_carton", "milk_carton")
+    belt.put(0, -0.067, -0.105, -0.14)
+    belt.cell.put(1, belt.cell.layout.base_from_tray @ on_tray(0.348, 0.14, np.pi))
+    layout = belt.cell.layout
+    tray = inverse(layout.base_from_belt) @ layout.base_from_tray
+    watch = BeltWatch(belt.sensor.capture_empty(), models, tray)
+    frame = steady(lambda: belt.sensor.capture(0), frames=8)
+
+    sight = watch.sight(frame, "milk_carton")
+
+    assert sight.known
+    assert np.hypot(*(sight.belt_from_product[:2, 3] - [-0.067, -0.105])) < 0.006
+    assert watch.sight(frame, "meal_tray") is None, "a carton is no meal tray"
 
 
 # Fused images

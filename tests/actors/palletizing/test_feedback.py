@@ -1,16 +1,20 @@
 """What feedback decides, what it asks, and what the operator may answer."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
+from rich.console import Console
 
 pytest.importorskip("open3d", exc_type=ImportError)
 pytest.importorskip("mujoco", exc_type=ImportError)
 
 from actors.palletizing import vocabulary as words
+from actors.palletizing.demo_packing import follow
 from actors.palletizing.feedback import HandlingFeedback
-from actors.palletizing.handling import UNRECOGNISED
-from actors.palletizing.operator import Operator
+from actors.palletizing.handling import TAKEN_OUT, UNRECOGNISED
+from actors.palletizing.operator import LOOKS, Operator
+from actors.running_cell import DemoError
 from enact_dist import Entity, testing
 
 from .handled_cell import (
@@ -50,8 +54,36 @@ def test_feedback_decides_by_what_was_seen(cell, results, seen, verdict, x_m, wa
     assert (read(cell, words.USER, words.QUESTION) is not None) == (wanted == "ask")
 
 
-def test_operator_answers_and_the_robot_rejects(cell, capsys):
-    """A deformed package goes to the bin when the operator says so; the result says why."""
+@pytest.mark.parametrize("unfit", ["", "the package lies on its side on the belt"])
+def test_a_package_that_was_lost_and_is_on_the_belt_is_retried_if_it_stands(cell, unfit):
+    """What lies is asked about at once, by name; nothing is tried that cannot succeed."""
+    come(cell)
+    testing.run_once(HandlingFeedback(), cell)
+    packed(cell, "held", "lost", "aside")
+    seen = each(cell, words.PACKAGES, words.SIGHTING, "online")[PACKAGE]
+    write(cell, PACKAGE, words.SIGHTING, replace(seen, unfit=unfit))
+    looked(cell, "belt", "missing")
+    testing.run_once(HandlingFeedback(), cell)
+    request = read(cell, words.SYSTEM, words.REQUEST)
+    assert (request.kind, request.seen) == ("ask" if unfit else "retry", "belt")
+    if unfit:
+        assert request.reason == f"place: lost; {unfit}"
+        assert read(cell, words.USER, words.QUESTION).choices == ("removed", "stop", "look")
+
+
+def test_what_comes_lying_is_asked_about(cell):
+    """A person sets it upright and lets the cell look: it is packed."""
+    come(cell, product="")
+    seen = each(cell, words.PACKAGES, words.SIGHTING, "online")[PACKAGE]
+    write(cell, PACKAGE, words.SIGHTING, replace(seen, unfit="the package leans on the belt by 9°"))
+    testing.run_once(HandlingFeedback(), cell)
+    question = read(cell, words.USER, words.QUESTION)
+    assert question.text == "place/0: the package leans on the belt by 9°"
+    assert question.choices == ("removed", "stop", "look")
+
+
+def deformed_and_refused(cell):
+    """Let a package be placed and found deformed, and the operator reject it."""
     come(cell)
     testing.run_once(HandlingFeedback(), cell)
     packed(cell, "held", "placed", "in_contact", "aside")
@@ -61,6 +93,11 @@ def test_operator_answers_and_the_robot_rejects(cell, capsys):
     testing.run_once(HandlingFeedback(), cell)
     testing.run_once(Operator(answers="reject"), cell)
     testing.run_once(HandlingFeedback(), cell)
+
+
+def test_operator_answers_and_the_robot_rejects(cell, capsys):
+    """A deformed package goes to the bin when the operator says so; the result says why."""
+    deformed_and_refused(cell)
     assert read(cell, words.SYSTEM, words.REQUEST).kind == "reject"
     assert packed(cell, "held", "rejected", "aside") == ["regrasp", "remove", "aside"]
     looked(cell, "")
@@ -72,15 +109,7 @@ def test_operator_answers_and_the_robot_rejects(cell, capsys):
 
 def test_a_package_that_could_not_be_rejected_is_not_placed_again(cell):
     """Whatever a failed grasp would else lead to: the operator is asked once more."""
-    come(cell)
-    testing.run_once(HandlingFeedback(), cell)
-    packed(cell, "held", "placed", "in_contact", "aside")
-    on_tray = each(cell, words.PLACES, words.PLAN)[PLACE].tray_from_product
-    write(cell, PACKAGE, words.SIGHTING, words.Sighting(0, on_tray, 0, 0, "tray", "milk_carton"))
-    looked(cell, "tray", "deformed")
-    testing.run_once(HandlingFeedback(), cell)
-    testing.run_once(Operator(answers="reject"), cell)
-    testing.run_once(HandlingFeedback(), cell)
+    deformed_and_refused(cell)
 
     packed(cell, "missed", "aside")
     looked(cell, "tray", "ok")
@@ -199,7 +228,9 @@ def test_a_sensor_that_fails_is_looked_through_again_before_the_operator_is_aske
     for _ in range(3):
         looked(cell, "", error=error)
         testing.run_once(feedback, cell)
-        kinds.append(read(cell, words.SYSTEM, words.REQUEST).kind)
+        request = read(cell, words.SYSTEM, words.REQUEST)
+        assert request.seen == "", "it was taken from the belt, where the next one may stand"
+        kinds.append(request.kind)
         if kinds[-1] == "look":
             packed(cell, "aside")
     assert kinds == ["look", "look", "ask"]
@@ -211,6 +242,39 @@ def test_a_sensor_that_fails_is_looked_through_again_before_the_operator_is_aske
     looked(cell, "tray", "ok")
     testing.run_once(feedback, cell)
     assert read(cell, words.SYSTEM, words.RESULTS)[PLACE.name].result == "placed"
+
+
+def test_a_script_that_looks_stops_where_looking_shows_nothing(cell, capsys):
+    """A sensor that has failed for good ends in a stop, with its reason; a person can go on."""
+    come(cell)
+    feedback, operator = HandlingFeedback(), Operator(answers="reject removed look")
+    testing.run_once(feedback, cell)
+    packed(cell, "held", "placed", "in_contact", "aside")
+    write(
+        cell,
+        PACKAGE,
+        words.SIGHTING,
+        replace(each(cell, words.PACKAGES, words.SIGHTING, "online")[PACKAGE], frame=""),
+    )
+    kinds = []
+    for _ in range(4 * LOOKS):
+        looked(cell, "", error="the tray sensor gave no image: unplugged")
+        testing.run_once(feedback, cell)
+        testing.run_once(operator, cell)
+        testing.run_once(feedback, cell)
+        kinds.append(read(cell, words.SYSTEM, words.REQUEST).kind)
+        if kinds[-1] == "stop":
+            break
+        packed(cell, "aside")
+    assert kinds == ["look"] * 2 + ["removed"] * 3 + ["look"] * 4 + ["stop"]
+    assert "stop: after 6 looks the script looks no more" in capsys.readouterr().out
+    shown = SimpleNamespace(packages=4, log="cell.log", check=lambda: None)
+    with pytest.raises(DemoError, match="script has stopped the cell: place/0: the tray sensor"):
+        follow(cell, shown, Console())
+    number = read(cell, words.SYSTEM, words.REQUEST).number
+    write(cell, words.SYSTEM, words.DECISION, words.Decision(number, "look", "a test"))
+    testing.run_once(feedback, cell)
+    assert read(cell, words.SYSTEM, words.REQUEST).kind == "look"
 
 
 def test_a_package_that_came_unseen_is_looked_for_and_asked_about(cell):
@@ -260,6 +324,45 @@ def test_what_has_come_and_is_not_recognised_is_asked_about(cell):
     looked(cell, "")
     testing.run_once(feedback, cell)
     assert read(cell, words.SYSTEM, words.REQUEST).kind == "pack"
+
+
+def test_what_is_taken_out_of_the_light_barrier_is_not_asked_about_any_more(cell):
+    """The question ends by itself, with the reason; the next package is for the next place."""
+    feedback = HandlingFeedback()
+    write(cell, words.CONVEYOR, words.SIGHT, words.Sight(0, UNRECOGNISED))
+    for _ in range(3):
+        testing.run_once(feedback, cell)
+        if read(cell, words.SYSTEM, words.REQUEST).kind == "look":
+            packed(cell, "aside")
+            looked(cell, "", error=UNRECOGNISED)
+    assert read(cell, words.SYSTEM, words.REQUEST).kind == "ask"
+    write(cell, words.CONVEYOR, words.SIGHT, words.Sight(0, TAKEN_OUT))
+    testing.run_once(feedback, cell)
+    result = read(cell, words.SYSTEM, words.RESULTS)[PLACE.name]
+    assert (result.result, result.package, result.reason) == ("removed", "", TAKEN_OUT)
+    planned(cell)
+    come(cell, product="meal_tray", number=1, package=Entity("package/b"))
+    testing.run_once(feedback, cell)
+    request = read(cell, words.SYSTEM, words.REQUEST)
+    assert (request.place, request.kind, request.tried) == ("place/1", "pack", ())
+
+
+def test_what_is_taken_out_before_anyone_asked_or_while_the_arm_looks_ends_as_well(cell):
+    """Without a request there is none to end; a look that is under way ends first."""
+    feedback = HandlingFeedback()
+    write(cell, words.CONVEYOR, words.SIGHT, words.Sight(0, TAKEN_OUT))
+    testing.run_once(feedback, cell)
+    assert read(cell, words.SYSTEM, words.RESULTS)[PLACE.name].result == "removed"
+    planned(cell)
+    write(cell, words.CONVEYOR, words.SIGHT, words.Sight(1, UNRECOGNISED))
+    testing.run_once(feedback, cell)
+    write(cell, words.CONVEYOR, words.SIGHT, words.Sight(1, TAKEN_OUT))
+    testing.run_once(feedback, cell)
+    assert "place/1" not in read(cell, words.SYSTEM, words.RESULTS)
+    packed(cell, "aside")
+    looked(cell, "", error=TAKEN_OUT)
+    testing.run_once(feedback, cell)
+    assert read(cell, words.SYSTEM, words.RESULTS)["place/1"].result == "removed"
 
 
 def test_what_the_operator_accepted_is_not_asked_about_again(cell):

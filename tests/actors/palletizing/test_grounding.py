@@ -8,9 +8,10 @@ import pytest
 
 from actors.geometry.kinematics import tool_poses
 from actors.geometry.reaching import reach
+from actors.palletizing import finger_room
 from actors.palletizing.grounding import (
-    FOLDER,
     BESIDE_M,
+    FOLDER,
     SKELETONS,
     Grasp,
     Gripper,
@@ -22,6 +23,8 @@ from actors.palletizing.grounding import (
 from actors.palletizing.net_files import text_of_net
 from actors.palletizing.nets import NetError
 from actors.palletizing.resolved_rate import ACCELERATION_RAD_S2
+from actors.palletizing.rows import RIM_M
+from actors.palletizing.simulation.cell_scene import CellLayout
 
 from .spring_arm import ARM, HOME_RAD, SpringArm, pose, run
 
@@ -77,7 +80,7 @@ def test_every_guarded_move_tares_and_asks_for_a_force_that_lasts(skeleton):
         assert primitive.tare == bool(asked), name
         assert all(condition.hold_s >= 0.012 for condition in asked), name
     push = grounded("push_into_contact").primitives["push"]
-    assert [str(way) for way in push.exits] == ["force_x < -10 N for 0.032 s", "distance > 0.085 m"]
+    assert [str(way) for way in push.exits] == ["force_x < -10 N for 0.032 s", "distance > 0.097 m"]
 
 
 @pytest.mark.parametrize("direction", [(0.0, -1.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0)])
@@ -93,7 +96,7 @@ def test_a_push_comes_from_behind_with_a_closed_hand(direction):
     half_m = 0.0475 if direction[1] else 0.10
 
     thick_m = 0.0445 if direction[1] else 0.012
-    assert behind_m == pytest.approx(half_m + thick_m + 0.022, abs=1e-6)
+    assert behind_m == pytest.approx(half_m + thick_m + BESIDE_M, abs=1e-6)
     np.testing.assert_allclose(base_from_frame[:3, 0], direction, atol=1e-9)
     assert (net.primitives["behind"].tool, net.primitives["behind"].tool_value) == ("width", 0.066)
     assert (push.axes[0].mode, push.axes[0].value) == ("velocity", 0.08)
@@ -142,17 +145,72 @@ def tool_pose(primitive, base_from_entity):
 def test_a_package_among_others_is_taken_only_where_the_fingers_have_room(
     along_m, across_m, turn_rad, room
 ):
-    """A finger that came down on a neighbour would spoil it; on the belt nothing stands beside."""
+    """A finger that came down on a neighbour would spoil it."""
     from actors.geometry.poses import turned
 
     stands = FRAMES["package/17"] @ pose(along_m, across_m, 0.0, turned(0.0, 0.0, turn_rad))
     beside = (("place/2", stands, JOB.size_m),)
-    assert grounded("grasp_from_belt", beside=beside)
     if room:
         assert grounded("regrasp", beside=beside)
         return
     with pytest.raises(NetError, match="place/2 leaves no room for a finger beside it"):
         grounded("regrasp", beside=beside)
+
+
+def test_beside_the_rim_of_the_tray_a_package_is_held_higher():
+    """A finger would come down on the rim; the tips end above it, and the place knows."""
+    tray = pose(0.40, 0.45 - 0.067 - 0.325, 0.002)  # its rim is 20 mm beside the package
+    plain = {name: grounded(name) for name in ("grasp_from_belt", "place")}
+    beside = {name: grounded(name, frames={**FRAMES, "tray": tray}) for name in plain}
+
+    raised = [
+        each["grasp_from_belt"].primitives["reach"].frame.offset[2, 3] for each in (plain, beside)
+    ]
+    assert raised[0] == pytest.approx(0.040)
+    assert raised[1] == pytest.approx(RIM_M + 0.003 + Gripper().tips_m)
+    lowered = [each["place"].primitives["lower"].frame.offset[2, 3] for each in (plain, beside)]
+    assert lowered[1] - lowered[0] == pytest.approx(raised[1] - raised[0])
+    far = {**FRAMES, "tray": pose(0.40, 0.0, 0.002)}
+    assert text_of_net(grounded("place", frames=far)) == text_of_net(plain["place"])
+    low = np.array([0.20, 0.095, 0.044])
+    assert grounded("grasp_from_belt", size_m=low)
+    with pytest.raises(NetError, match="the rim of the tray leaves no room for a finger beside it"):
+        grounded("grasp_from_belt", size_m=low, frames={**FRAMES, "tray": tray})
+
+
+@pytest.mark.parametrize(
+    ("height_m", "point_m", "force_n"),
+    [(0.030, 0.053, 45.0), (0.017, 0.040, 45.0), (0.054, 0.077, 25.0)],
+)
+def test_the_hand_grasps_over_what_is_low(height_m, point_m, force_n):
+    """The rim of the tray, or a lower package; all stages of the request hold it so."""
+    stands = FRAMES["package/17"] @ pose(0.0, 0.0975, 0.0)
+    beside = (("place/2", stands, np.array([0.2, 0.095, height_m])),)
+    plain = {name: grounded(name) for name in ("grasp_from_belt", "regrasp", "place")}
+    over = {name: grounded(name, beside=beside) for name in plain}
+    for name, primitive in (("grasp_from_belt", "reach"), ("regrasp", "down"), ("place", "lower")):
+        offsets = [each[name].primitives[primitive].frame.offset[2, 3] for each in (plain, over)]
+        assert offsets == pytest.approx([0.040, point_m])
+        assert grounded(name, beside=(*beside, ("place/1", FRAMES["place/3"], JOB.size_m)))
+    assert over["regrasp"].primitives["grasp"].tool_value == force_n
+    high = (("place/2", stands, JOB.size_m),)
+    with pytest.raises(NetError, match="place/2 leaves no room for a finger beside it"):
+        grounded("grasp_from_belt", beside=high)
+    offset = grounded("place", beside=high).primitives["lower"].frame.offset
+    assert offset[2, 3] == pytest.approx(0.040), "what was taken is put down"
+
+
+def test_the_rim_stands_around_the_tray():
+    """What the hand goes over is as large as what stands in the cell."""
+    layout = CellLayout()
+    assert layout.rim_m == RIM_M
+    rim = finger_room.rim_beside(layout.base_from_tray)
+    corners = [np.abs(stands[:3, :3]) @ size_m / 2.0 for _, stands, size_m in rim]
+    sides = [stands[:3, 3] for _, stands, _ in rim]
+    ends = np.array([(at - half, at + half) for at, half in zip(sides, corners, strict=True)])
+    middle = layout.base_from_tray[:2, 3]
+    assert ends[:, 1, :2].max(axis=0) - middle == pytest.approx([0.322, 0.452], abs=0.004)
+    assert middle - ends[:, 0, :2].min(axis=0) == pytest.approx([0.322, 0.452], abs=0.004)
 
 
 def test_a_package_is_grasped_placed_and_pushed_into_contact():

@@ -6,10 +6,11 @@ import pytest
 pytest.importorskip("open3d", exc_type=ImportError)
 pytest.importorskip("mujoco", exc_type=ImportError)
 
+from actors.geometry.poses import turned
 from actors.palletizing import vocabulary as words
 from actors.palletizing.deviation import DeviationDetection
 from actors.palletizing.grounding import aside_net
-from actors.palletizing.handling import UNRECOGNISED
+from actors.palletizing.handling import TAKEN_OUT, UNRECOGNISED
 from actors.palletizing.handling_perception import UNSEEN_LOOKS, EmptyBelt, HandlingPerception
 from actors.palletizing.nets import Execution
 from actors.palletizing.planning import RowPlanning
@@ -92,6 +93,16 @@ def on_tray(cell, physical, number, *, beside_m=0.0):
     physical.put(number, LAYOUT.base_from_tray @ pose)
 
 
+def arrived(cell, physical):
+    """Let the first package come and be seen on the belt; return perception and the package."""
+    perception = HandlingPerception("belt", "tray", frames=2)
+    on_belt(physical, 0)
+    write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(0, 7))
+    testing.run_once(perception, cell)
+    (package,) = each(cell, "online", words.PACKAGES, words.SIGHTING)
+    return perception, package
+
+
 def test_a_package_has_one_entity_from_the_belt_to_the_tray(cell, physical):
     """It is recognised where it comes, and judged where it goes; so is its neighbour, when moved."""
     perception, detection = HandlingPerception("belt", "tray", frames=2), DeviationDetection()
@@ -133,11 +144,7 @@ def test_a_package_has_one_entity_from_the_belt_to_the_tray(cell, physical):
 
 def test_a_package_that_was_missed_is_seen_on_the_belt_again(cell, physical):
     """After a grasp that failed only the belt is looked at; the tray is not judged."""
-    perception = HandlingPerception("belt", "tray", frames=2)
-    on_belt(physical, 0)
-    write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(0, 7))
-    testing.run_once(perception, cell)
-    (package,) = each(cell, "online", words.PACKAGES, words.SIGHTING)
+    perception, package = arrived(cell, physical)
     ended(cell, 1, package.name, "place/0", stage="grasp", success=False)
     testing.run_once(perception, cell)
     look = read(cell, words.SYSTEM, words.LOOK)
@@ -147,11 +154,7 @@ def test_a_package_that_was_missed_is_seen_on_the_belt_again(cell, physical):
 
 def test_a_package_that_is_nowhere_is_missing(cell, physical):
     """Lost on the way: not on the tray; the place is flagged, the package has left the cell."""
-    perception = HandlingPerception("belt", "tray", frames=2)
-    on_belt(physical, 0)
-    write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(0, 7))
-    testing.run_once(perception, cell)
-    (package,) = each(cell, "online", words.PACKAGES, words.SIGHTING)
+    perception, package = arrived(cell, physical)
     physical.take_away(0)
     ended(cell, 1, package.name, "place/0", stage="place", success=False)
     testing.run_once(perception, cell)
@@ -160,14 +163,38 @@ def test_a_package_that_is_nowhere_is_missing(cell, physical):
     assert read(cell, words.SYSTEM, words.DEVIATIONS)["place/0"].verdict == "missing"
 
 
+@pytest.mark.parametrize(
+    ("roll_deg", "unfit"), [(0.0, ""), (90.0, "the package lies on its side on the belt")]
+)
+def test_a_package_that_was_lost_on_its_way_is_looked_for_on_the_belt(
+    cell, physical, roll_deg, unfit
+):
+    """It is not on the tray, and nothing else has come: it is seen where and how it lies."""
+    perception, package = arrived(cell, physical)
+    lies = on_belt(physical, 0)
+    lies[:3, :3] = lies[:3, :3] @ turned(np.deg2rad(roll_deg), 0.0, 0.0)
+    lies[:3, 3] += LAYOUT.base_from_belt[:3, :3] @ [0.05, -0.02, 0.0475 if roll_deg else 0.0]
+    physical.put(0, lies)
+    ended(cell, 1, package.name, "place/0", stage="place", success=False)
+    testing.run_once(perception, cell)
+    testing.run_once(DeviationDetection(), cell)
+    assert read(cell, words.SYSTEM, words.LOOK).seen == "belt"
+    assert read(cell, words.SYSTEM, words.DEVIATIONS)["place/0"].verdict == "missing"
+    seen = each(cell, "online", words.PACKAGES, words.SIGHTING)[package]
+    assert (seen.frame, seen.product, seen.unfit) == ("belt", "milk_carton", unfit)
+    off = LAYOUT.base_from_belt @ seen.frame_from_package - lies
+    assert unfit or np.hypot(*off[:2, 3]) < 0.012
+    write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(1, 8))
+    testing.run_once(perception, cell)
+    ended(cell, 2, package.name, "place/0", stage="place", success=False)
+    testing.run_once(perception, cell)
+    assert read(cell, words.SYSTEM, words.LOOK).seen == "", "it may be the next one"
+
+
 def test_a_package_in_the_hand_is_not_judged(cell, physical):
     """What could not be put down hangs above the tray and tells nothing of its place."""
-    perception = HandlingPerception("belt", "tray", frames=2)
     testing.run_once(TrainingGrasp("milk_carton=0.5 meal_tray=0.35"), cell)
-    on_belt(physical, 0)
-    write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(0, 7))
-    testing.run_once(perception, cell)
-    (package,) = each(cell, "online", words.PACKAGES, words.SIGHTING)
+    perception, package = arrived(cell, physical)
     grasp = each(cell, "training", words.PRODUCTS, words.GRASP)[Entity("product/milk_carton")]
     ended(cell, 1, package.name, "place/0", stage="place", success=False)
     state = words.GripState(1, grasp.width_m - 0.002, 0.0, 40.0, 7)
@@ -182,11 +209,7 @@ def test_a_package_in_the_hand_is_not_judged(cell, physical):
 @pytest.mark.parametrize("result", ["blocked", "timeout:away", "interrupted:away"])
 def test_an_arm_that_is_not_aside_hides_the_tray(cell, physical, result):
     """It stopped on its way: nothing is judged below it, and the request is answered by name."""
-    perception = HandlingPerception("belt", "tray", frames=2)
-    on_belt(physical, 0)
-    write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(0, 7))
-    testing.run_once(perception, cell)
-    (package,) = each(cell, "online", words.PACKAGES, words.SIGHTING)
+    perception, package = arrived(cell, physical)
     on_tray(cell, physical, 0)
     ended(cell, 1, package.name, "place/0", aside=result)
     testing.run_once(perception, cell)
@@ -199,11 +222,7 @@ def test_an_arm_that_is_not_aside_hides_the_tray(cell, physical, result):
 @pytest.mark.parametrize("stays", [True, False])
 def test_what_shall_be_gone_is_looked_for(cell, physical, kind, stays):
     """After a removal the tray tells whether the package is gone; its place is not judged."""
-    perception = HandlingPerception("belt", "tray", frames=2)
-    on_belt(physical, 0)
-    write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(0, 7))
-    testing.run_once(perception, cell)
-    (package,) = each(cell, "online", words.PACKAGES, words.SIGHTING)
+    perception, package = arrived(cell, physical)
     on_tray(cell, physical, 0)
     ended(cell, 1, package.name, "place/0")
     testing.run_once(perception, cell)
@@ -224,11 +243,7 @@ def test_what_shall_be_gone_is_looked_for(cell, physical, kind, stays):
 )
 def test_a_tray_sensor_that_fails_is_named_and_nothing_is_judged(cell, physical, kind, error):
     """The look says why; once it works, the next look judges."""
-    perception = HandlingPerception("belt", "tray", frames=2)
-    on_belt(physical, 0)
-    write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(0, 7))
-    testing.run_once(perception, cell)
-    (package,) = each(cell, "online", words.PACKAGES, words.SIGHTING)
+    perception, package = arrived(cell, physical)
     on_tray(cell, physical, 0)
     ended(cell, 1, package.name, "place/0")
     testing.run_once(perception, cell)
@@ -281,6 +296,19 @@ def test_what_is_seen_again_and_again_nowhere_is_reported(cell, physical):
     assert errors == [*[""] * (UNSEEN_LOOKS - 1), UNRECOGNISED]
     on_belt(physical, 0)
     write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(0, UNSEEN_LOOKS + 1))
+    testing.run_once(perception, cell)
+    assert read(cell, words.CONVEYOR, words.SIGHT).error == ""
+    assert len(each(cell, "online", words.PACKAGES, words.SIGHTING)) == 1
+
+
+def test_what_was_taken_out_of_the_light_barrier_is_reported_at_once(cell, physical):
+    """The barrier is free and the belt shows nothing; something on the belt is seen all the same."""
+    perception = HandlingPerception("belt", "tray", frames=2)
+    write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(0, 1, is_gone=True))
+    testing.run_once(perception, cell)
+    assert read(cell, words.CONVEYOR, words.SIGHT).error == TAKEN_OUT
+    on_belt(physical, 0)
+    write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(0, 2, is_gone=True))
     testing.run_once(perception, cell)
     assert read(cell, words.CONVEYOR, words.SIGHT).error == ""
     assert len(each(cell, "online", words.PACKAGES, words.SIGHTING)) == 1

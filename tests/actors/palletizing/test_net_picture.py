@@ -1,16 +1,19 @@
 """Pictures of nets: every state and exit is in them, coloured by outcome, with the run."""
 
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 
 import pytest
 
 from actors.palletizing.grounding import SKELETONS
-from actors.palletizing.net_picture import svg_of_net
+from actors.palletizing.net_picture import WIDTH, svg_of_net
 
 from .sound_nets import net, primitive, way
 from .spring_arm import SpringArm, run
 from .test_grounding import FRAMES, grounded
 
+NOTE_PX = 6.3
+"""Width of a letter of a note, in the middle."""
 SVG = "{http://www.w3.org/2000/svg}"
 
 
@@ -47,6 +50,24 @@ def test_every_state_and_every_exit_is_drawn_once(skeleton):
     assert {str(e) for p in drawn.primitives.values() for e in p.exits} <= texts
 
 
+@pytest.mark.parametrize("skeleton", SKELETONS)
+def test_what_a_primitive_does_fits_into_its_box(skeleton):
+    """Names of entities are as long as those of a running cell; boxes name the parameter."""
+    drawn = grounded(skeleton)
+    frames = {
+        name: replace(p.frame, entity=f"{p.frame.entity}-5449387aad6b60a4")
+        for name, p in drawn.primitives.items()
+    }
+    long = replace(
+        drawn,
+        primitives={name: replace(p, frame=frames[name]) for name, p in drawn.primitives.items()},
+        grounded={name: f"{entity}-5449387aad6b60a4" for name, entity in drawn.grounded.items()},
+    )
+    notes = [t.text for t in ET.fromstring(svg_of_net(long)).iter(f"{SVG}text")
+             if t.get("class") == "note"]  # fmt: skip
+    assert max(map(len, notes)) * NOTE_PX < WIDTH - 10.0
+
+
 def test_a_run_is_the_thick_line():
     """The exits that were taken, how long each primitive took, and the end it came to."""
     pushed = run(grounded("push_into_contact"), SpringArm(), FRAMES.__getitem__).execution()
@@ -57,7 +78,7 @@ def test_a_run_is_the_thick_line():
     }
     thick = {name for name, box in states(svg).items() if box.get("stroke-width") == "3.0"}
     assert thick == {step.primitive for step in pushed.trace} | {"no_neighbour"}
-    assert "push_into_contact (package package/17, place place/3): no_neighbour" in svg
+    assert "push_into_contact (package/17, place/3): no_neighbour" in svg
     assert f"push  {pushed.trace[3].elapsed_s:.2f} s" in svg
 
 

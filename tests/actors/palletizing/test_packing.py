@@ -5,8 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
+from actors.geometry.poses import on_tray
 from actors.geometry.shapes import Surface
 from actors.palletizing.packing import Packing
+from actors.palletizing.packing_records import Packed
 from actors.palletizing.packing_scores import (
     Tray,
     confusion,
@@ -56,6 +58,48 @@ def test_a_hand_that_comes_down_on_a_package_feels_where_it_is():
     assert not packed.by_hand
 
 
+def test_a_hand_goes_down_clear_of_a_package_that_was_grasped_off_its_middle():
+    """Seen 22 mm beside where it is, along its row: it stands so far behind when it is pushed."""
+    [package] = drawn("meal_tray")
+    off = dataclasses.replace(package, pick_offset_m=(-0.022, 0.0))
+    [packed] = Packing([off], MODELS, seed=3).run()
+    assert [step.reaction for step in packed.steps] == ["go_on"]
+    assert max(packed.dents_mm, default=0.0) < 1.0
+
+
+def drawn(*products):
+    """Return packages of one friction."""
+    return draw_packages(
+        len(products), seed=3, products=products, spread=Spread(friction=(0.4, 0.4))
+    )
+
+
+def test_a_carton_is_taken_anew_over_a_lower_package():
+    """It stands nearer to the next row than a finger is thick, and the meal tray there is lower."""
+    packages = drawn(*["meal_tray"] * 5, "milk_carton")
+    cell = Packing(packages, MODELS, seed=3)
+    packed = [Packed(each.number, each.product, each.friction) for each in packages]
+    places = [cell.layout.base_from_tray @ slot.tray_from_product for slot in cell.slots]
+    for number in range(5):
+        cell.cell.replace(number, places[number])
+        cell.pack(packed[number], packed, request="look")
+    cell._flagged.clear()  # as before each package
+    cell.cell.replace(5, places[5] @ on_tray(0.013, 0.021, 0.0))
+    cell.pack(packed[5], packed, request="look")
+    assert [step.request for step in packed[5].steps] == ["look", "regrasp"]
+    assert packed[5].steps[-1].after == "ok"
+    assert not packed[5].steps[-1].harmed
+
+
+def test_a_finger_over_the_film_of_a_meal_tray_is_felt_before_it_dents():
+    """The film lies lower than the rim: the hand feels its way down to it."""
+    [package] = draw_packages(1, seed=3, products=["meal_tray"], spread=Spread(friction=(0.4, 0.4)))
+    off = dataclasses.replace(package, pick_offset_m=(-0.018, -0.010))
+    [packed] = Packing([off], MODELS, seed=3).run()
+    assert packed.steps[0].stages[-1][1] == "blocked_left"
+    assert packed.steps[0].after == "belt", "it is not dented"
+
+
 def test_each_error_is_provoked_by_physics_seen_and_answered():
     """A dent, a fall, a slide: what the camera says is what physics did, and each has its answer.
 
@@ -97,4 +141,23 @@ def test_a_package_that_the_gripper_drops_is_missing_and_is_not_counted_before()
         ("retry", (("place", "lost"),)),
     ]
     assert packed.judgements[0].truth == packed.judgements[0].verdict == "missing"
-    assert packed.judgements[0].at_s == packed.steps[1].at_s, "nothing was put there before"
+    assert packed.judgements[0].at_s > packed.steps[0].at_s, "nothing was put there before"
+
+
+@pytest.mark.parametrize(
+    ("product", "stages", "reaction"),
+    [
+        ("meal_tray", ["lost", "in_contact"], "it stands as planned"),
+        ("milk_carton", ["lost"], "place: lost; the package leans on the belt by 28°"),
+    ],
+)
+def test_what_is_dropped_over_the_edge_of_the_belt_is_taken_from_there_if_it_stands(
+    product, stages, reaction
+):
+    """A finger would come down on the tray's rim beside it; one that leans is asked about."""
+    packages = draw_packages(1, seed=3, products=[product], spread=Spread(friction=(0.4, 0.4)))
+    knocks = {0: Knock("missing", 0.1, (0.0, 0.0))}
+    [packed] = Packing(packages, MODELS, seed=3, knocks=knocks).run()
+    assert [step.stages[-1][1] for step in packed.steps] == stages
+    assert packed.steps[-1].reason == reaction
+    assert packed.by_hand == (len(stages) == 1)

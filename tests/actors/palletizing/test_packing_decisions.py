@@ -1,5 +1,7 @@
 """Where packages shall stand, how they are held, and what follows from what was seen."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -7,9 +9,17 @@ from actors.geometry.reaching import reach
 from actors.geometry.shapes import Surface
 from actors.palletizing.grasps import grasp_of, size_of
 from actors.palletizing.grounding import Grasp
-from actors.palletizing.handling import fills, is_held
+from actors.palletizing.handling import felt_on, fills, is_held
 from actors.palletizing.handling_data import GripCommand, GripState
-from actors.palletizing.reactions import MOST, REACTIONS, Case, choices_of, react, worst
+from actors.palletizing.reactions import (
+    MOST,
+    REACTIONS,
+    UNFIT_ON_BELT,
+    Case,
+    choices_of,
+    react,
+    worst,
+)
 from actors.palletizing.rows import contacts_between, planned_rows
 from actors.palletizing.simulation.cell_scene import (
     ARM,
@@ -125,11 +135,16 @@ def test_flat_faces_are_pressed_harder_than_rims():
         (Case("place", "blocked", success=False, seen="hand"), "reject"),
         (Case("push_into_contact", "in_contact", True, "moved", along_mm=-14.0), "push_again"),
         (Case("push_into_contact", "in_contact", True, "moved", across_mm=14.0), "regrasp"),
+        (Case("push_into_contact", "in_contact", True, "moved", -30.0, -26.0), "regrasp"),
+        (Case("push_into_contact", "in_contact", True, "moved", -21.0, 17.0), "regrasp"),
+        (Case("push_into_contact", "in_contact", True, "moved", -35.0, 7.0), "push_again"),
+        (Case("push_into_contact", "in_contact", True, "moved", -80.0, 7.0), "ask"),
         (Case("push_into_contact", "in_contact", True, "moved", across_mm=64.0), "ask"),
         (Case("push_into_contact", "in_contact", True, "tipped"), "ask"),
         (Case("push_into_contact", "in_contact", True, "deformed"), "ask"),
         (Case("grasp_from_belt", "not_seen", success=False, seen="belt"), "retry"),
-        (Case("grasp_from_belt", "not_seen", False, seen="belt", tried={"retry": 1}), "ask"),
+        (Case("place", "lost", success=False, verdict="missing", seen="belt"), "retry"),
+        (Case("place", "lost", False, "missing", seen="belt", unfit="it lies"), "ask"),
         (Case("regrasp", "no_net: no room", False, "moved", across_mm=14.0), "ask"),
         (Case("place", "sensor:frozen", success=False, seen="hand"), "stop"),
         (Case("place", "interrupted:carry", success=False, seen="hand"), "stop"),
@@ -185,6 +200,27 @@ def test_what_the_hand_holds_is_known_by_what_it_does(grip, gripper, held):
     assert fills(0.0, GRASP) is False
 
 
+MEAL_TRAY = dataclasses.replace(GRASP, width_m=0.120)
+
+
+@pytest.mark.parametrize(
+    ("grasp", "results", "felt_mm"),
+    [
+        (GRASP, ["blocked_left"], 27.0),  # the hand had 15 mm of room
+        (GRASP, ["blocked_left", "blocked_right"], 13.5),
+        (MEAL_TRAY, ["blocked_left"], 13.5),  # 7.5 mm
+        (MEAL_TRAY, ["blocked_right", "blocked_right"], -27.0),
+        (MEAL_TRAY, ["blocked_right", "blocked", "missed"], -13.5),
+    ],
+)
+def test_a_second_grasp_goes_as_far_as_the_hand_had_no_room(grasp, results, felt_mm):
+    """Two grasps of a meal tray find one that is 20 mm beside where it was seen."""
+    felt_m = 0.0
+    for result in results:
+        felt_m = felt_on(felt_m, result, grasp)
+    assert 1e3 * felt_m == pytest.approx(felt_mm)
+
+
 @pytest.mark.parametrize(
     ("verdict", "seen", "tried", "wanted"),
     [
@@ -195,6 +231,7 @@ def test_what_the_hand_holds_is_known_by_what_it_does(grip, gripper, held):
         ("moved", "tray", (), ("regrasp", "go_on", "reject", "removed", "stop", "look")),
         ("deformed", "tray", (), ("go_on", "reject", "removed", "stop", "look")),
         ("tipped", "tray", (), ("go_on", "removed", "stop", "look")),
+        (UNFIT_ON_BELT, "belt", (), ("removed", "stop", "look")),
         ("missing", "", (), ("go_on", "removed", "stop", "look")),
     ],
 )

@@ -45,7 +45,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timing]
 T = TypeVar("T")
 LONG_S = 90.0
 """What a busy machine may take for anything; it is no claim."""
-PACKAGES = 6
+PACKAGES = 7
 SEED = 7
 
 
@@ -116,6 +116,13 @@ class Trial:
         """Return all requests about a place, the oldest first."""
         every = [one.datum() for one in self.online.history(SYSTEM, REQUEST)]
         return [one for one in every if one.place == place]
+
+    def looks(self, place: str, error: str) -> Request:
+        """Wait until a request about a place gives an error as its reason; return it."""
+        return self.until(
+            f"{place}: {error}",
+            lambda: next((one for one in self.requests(place) if error in one.reason), None),
+        )
 
     def pid(self, name: str) -> int:
         """Return the process of an actor."""
@@ -195,6 +202,24 @@ def test_sensor_that_freezes_ends_the_net(trial: Trial) -> None:
 
     follows = next(one for one in trial.requests(request.place) if one.number == request.number + 1)
     assert follows.kind == "ask"
+
+
+def test_depth_sensor_that_is_blind_or_stands_still_is_looked_through_again(trial: Trial) -> None:
+    """Nothing is judged by old pictures: each failure has a name, and its end is not missed."""
+    net = trial.until("a net", lambda: trial.get(SYSTEM, NET)).number
+    trial.failed("blind", 600.0, "carried")
+    place = trial.request_of(trial.ended(net, "in_contact", "no_neighbour")).place
+
+    first = trial.looks(place, "the tray sensor gave no image")
+    trial.failed("camera", 600.0, "")
+    trial.hardware.fail("blind", 0.0)
+    second = trial.looks(place, "the tray sensor stands still")
+    trial.hardware.fail("camera", 0.0)
+    result = trial.closed(place)
+
+    assert first.kind == "look"
+    assert second.number > first.number
+    assert result.result in {"placed", "accepted", "rejected", "removed"}
 
 
 def test_push_outlives_the_restart_of_its_shard(trial: Trial) -> None:

@@ -3,9 +3,12 @@
 import dataclasses
 import math
 
+import numpy as np
 import pytest
 
+from actors.geometry.poses import on_tray
 from actors.palletizing import packing_scores
+from actors.palletizing.demo_packing_report import row_of
 from actors.palletizing.packing_records import Judgement, Packed, Step, line_of, packed_of
 from actors.palletizing.packing_scores import (
     EVERY,
@@ -17,8 +20,11 @@ from actors.palletizing.packing_scores import (
     scores_of,
     trays_of,
 )
-from actors.palletizing.packing_truth import badness
+from actors.palletizing.packing_truth import badness, state_of
+from actors.palletizing.simulation.cell_truth import PackageTruth
 from actors.palletizing.simulation.packages import DEMO_PRODUCTS
+from actors.palletizing.simulation.physical_packages import Dent
+from actors.palletizing.vocabulary import Deviation, Plan, Result
 from enact_dist.cli import bench
 from enact_dist.cli.main import main
 
@@ -55,7 +61,7 @@ def test_a_sound_package_meets_every_goal_that_it_is_a_case_of():
     assert cases == {
         "packages", "by_hand_share", "shift_p95_mm", "turn_p95_deg", "gap_p50_mm", "pose_p95_mm",
         "cycle_p50_s", "cycle_p95_s", "damaged_gentle", "damaged", "alarms_share", "provoked",
-        "dented", "recoveries", "noticed_by_net", "moved_cases", "tipped_cases", "deformed_cases",
+        "dented", "recoveries", "refused", "noticed_by_net", "moved_cases", "tipped_cases", "deformed_cases",
         "missing_cases",
     }  # fmt: skip
 
@@ -124,6 +130,32 @@ def test_a_retry_whose_package_was_knocked_is_no_failed_recovery():
     assert (scores["recoveries"], scores["recovered_share"], scores["worsened"]) == (1, 0.0, 1)
 
 
+@pytest.mark.parametrize("stages", [(), (("regrasp", "no_net: regrasp for it: no room"),)])
+def test_what_the_robot_refused_before_it_moved_is_no_recovery_that_was_tried(stages):
+    """It is counted apart; one that was refused in its second stage was tried."""
+    refused = dataclasses.replace(step("regrasp", "moved", "moved", works=False), stages=stages)
+    scores = scores_of({TRAY: [package(refused, step("retry"))]})
+    assert (scores["recoveries"], scores["refused"], scores["recovered_share"]) == (1, 1, 1.0)
+    assert scores["noticed_by_net"] == 0, "no net ran that could have noticed anything"
+    later = dataclasses.replace(refused, stages=(("grasp_from_belt", "held"), *stages))
+    assert scores_of({TRAY: [package(later)]})["recovered_share"] == 0.0
+
+
+def test_a_dent_that_was_there_before_makes_nothing_worse():
+    """A dented package that stands beside its place is brought there, and is as dented as before."""
+    planned, beside = np.eye(4), on_tray(0.02, 0.0, 0.0)
+    dent = Dent("top", (0.0, 0.0, 0.07), (0.0, 0.0, -1.0), 60.0, 5.0, "left")
+    states = {
+        (at is beside, bool(dents)): state_of(
+            PackageTruth(0, "milk_carton", "tray", at, at, 0.0, dents, 0, 0, 0.4, 0.5), planned
+        )
+        for at in (planned, beside)
+        for dents in ((), (dent,))
+    }
+    assert states[True, True] == states[False, True] == "deformed"
+    assert (states[True, False], states[False, False]) == ("moved", "ok")
+
+
 def test_a_failure_that_the_net_noticed_is_counted():
     failed = step("pack", "belt", "belt", result="blocked", works=False)
     assert scores_of({TRAY: [package(failed, step("retry"))]})["noticed_by_net"] == 1
@@ -140,6 +172,34 @@ def test_a_slight_dent_is_neither_sound_nor_deformed(dent_mm, slight):
     assert scores["deformed_precision_share"] == (None if slight else 0.0)
     wrong = dataclasses.replace(dented, verdict="moved")
     assert scores_of({TRAY: [package(judgements=[wrong])]})["moved_precision_share"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("depth_mm", "truth", "right"),
+    [
+        (1.0, "ok", {"ok"}),
+        (2.5, "dented", {"ok", "deformed"}),
+        (5.0, "deformed", {"deformed"}),
+    ],
+)
+def test_a_slight_dent_in_the_demo_may_be_flagged_or_not(depth_mm, truth, right):
+    """It is counted there as in the bench: physics calls it sound, perception is to find it."""
+    dent = Dent("top", (0.0, 0.0, 0.07), (0.0, 0.0, -1.0), 60.0, depth_mm, "left")
+    plan = Plan("milk_carton", 0, np.eye(4))
+    stands = PackageTruth(
+        0, "milk_carton", "tray", np.eye(4), np.eye(4), 0.0, (dent,), 0, 0, 0.4, 0.5
+    )
+    result = Result("package/a", "milk_carton", "", "placed", (), "why")
+    flags = {
+        verdict: Deviation("package/a", "milk_carton", verdict, 1.0, 1.0, 1.0, 1.0, 9)
+        for verdict in ("ok", "deformed", "moved")
+    }
+    rows = {
+        verdict: row_of("place/0", plan, stands, flag, result, None)
+        for verdict, flag in flags.items()
+    }
+    assert {row.truth for row in rows.values()} == {truth}
+    assert {verdict for verdict, row in rows.items() if row.correct} == right
 
 
 def test_the_table_sets_truth_against_verdict():

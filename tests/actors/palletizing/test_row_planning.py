@@ -1,5 +1,6 @@
 """Plans, belt and trays: what comes when, and whether the plan knows what became of the rest."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -22,8 +23,8 @@ from .handled_cell import (
     closed,
     come,
     each,
-    packed,
     executed,
+    packed,
     planned,
     read,
     write,
@@ -144,7 +145,7 @@ def empty_belt():
 
 
 def test_belt_waits_until_the_package_before_is_off_it(cell, monkeypatch):
-    """The next one comes while the robot places the one before, not earlier."""
+    """The next one comes when the one before was put down: what is lost may lie on the belt."""
     belt = Belt()
     monkeypatch.setattr("actors.palletizing.conveyor.open_controller", lambda _: belt)
     conveyor = BeltConveyor("any")
@@ -162,20 +163,60 @@ def test_belt_waits_until_the_package_before_is_off_it(cell, monkeypatch):
     testing.run_once(Action(), cell)
     for _ in range(3):
         testing.run_once(conveyor, cell)
+    assert belt.runs == 1
+    executed(cell, "placed")
+    packed(cell)
+    testing.run_once(Action(), cell)
+    for _ in range(3):
+        testing.run_once(conveyor, cell)
     assert (belt.runs, read(cell, words.CONVEYOR, words.ARRIVAL).number) == (2, 1)
 
 
-def test_a_tray_is_changed_by_a_plan_that_knows_all_results(cell, monkeypatch):
-    """The last one was rejected: the plan before that ended the tray, the one after does not."""
+def test_what_is_taken_out_of_the_light_barrier_unrecognised_is_reported(cell, monkeypatch):
+    """When the barrier has been free for a while; a package that has a name is followed by it."""
+    belt = Belt()
+    monkeypatch.setattr("actors.palletizing.conveyor.open_controller", lambda _: belt)
+    monkeypatch.setattr("actors.palletizing.conveyor.FREE_S", 0.0)
+    conveyor = BeltConveyor("any")
+    write(cell, words.BELT, words.EMPTY, empty_belt(), "training")
+    write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(0, time.time_ns()))
+
+    def gone():
+        testing.run_once(conveyor, cell)
+        return read(cell, words.CONVEYOR, words.ARRIVAL).is_gone
+
+    belt.there = True
+    assert not gone()
+    belt.there = False
+    request = words.Request(1, "ask", PLACE.name, "package/a", "why")
+    write(cell, words.SYSTEM, words.REQUEST, request)
+    assert not gone()
+    write(cell, words.SYSTEM, words.REQUEST, replace(request, package=""))
+    assert gone()
+    assert belt.runs == 0
+    closed(cell, place_0="removed")
+    planned(cell)
+    testing.run_once(conveyor, cell)
+    assert belt.runs == 1
+
+
+def two_on_a_tray(cell, monkeypatch):
+    """Return belt and conveyor of a cell in which two packages fill a tray, when both have come."""
     belt = Belt()
     monkeypatch.setattr("actors.palletizing.conveyor.open_controller", lambda _: belt)
     conveyor = BeltConveyor("any")
     write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(1, 7))
     write(cell, words.BELT, words.EMPTY, empty_belt(), "training")
-    for number in (2, 3):  # as if two packages filled a tray
+    for number in (2, 3):
         place = Entity(f"place/{number}")
         plan = each(cell, words.PLACES, words.PLAN)[place]
         write(cell, place, words.PLAN, replace(plan, tray=1), "training")
+    return belt, conveyor
+
+
+def test_a_tray_is_changed_by_a_plan_that_knows_all_results(cell, monkeypatch):
+    """The last one was rejected: the plan before that ended the tray, the one after does not."""
+    belt, conveyor = two_on_a_tray(cell, monkeypatch)
     closed(cell, place_0="placed", place_1="rejected")
     testing.run_once(conveyor, cell)
     assert (belt.changed, belt.runs) == (0, 0)
@@ -186,15 +227,7 @@ def test_a_tray_is_changed_by_a_plan_that_knows_all_results(cell, monkeypatch):
 
 def test_a_tray_is_changed_when_all_of_its_places_are_closed(cell, monkeypatch):
     """A neighbour that was opened again keeps it there."""
-    belt = Belt()
-    monkeypatch.setattr("actors.palletizing.conveyor.open_controller", lambda _: belt)
-    conveyor = BeltConveyor("any")
-    write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(1, 7))
-    write(cell, words.BELT, words.EMPTY, empty_belt(), "training")
-    for number in (2, 3):
-        place = Entity(f"place/{number}")
-        plan = each(cell, words.PLACES, words.PLAN)[place]
-        write(cell, place, words.PLAN, replace(plan, tray=1), "training")
+    belt, conveyor = two_on_a_tray(cell, monkeypatch)
     closed(cell, place_1="placed")
     planned(cell)
     testing.run_once(conveyor, cell)
