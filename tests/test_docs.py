@@ -47,7 +47,12 @@ def test_links_of_a_page_lead_to_files_and_headings(page):
             assert anchor in names, target
 
 
+def test_readme_is_short():
+    """One reads it whole; what serves one purpose only has its own page."""
+    assert len((ROOT / "README.md").read_text("utf-8").splitlines()) <= 200
+
+
 def test_readme_leads_to_each_page():
-    """A page that nothing leads to is read by nobody."""
+    """No reader finds a page that nothing leads to."""
     readme = (ROOT / "README.md").read_text("utf-8")
     assert [page.name for page in PAGES if f"enact_dist/docs/{page.name}" not in readme] == []

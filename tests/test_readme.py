@@ -35,14 +35,6 @@ def test_example_runs_as_pasted():
     assert (done.returncode, done.stdout.strip()) == (0, "ran to the end"), done.stderr
 
 
-def test_example_of_time_runs_as_pasted():
-    """History, the past, forks: what it prints stands beside it."""
-    code = next(block for block in blocks("python") if "online.fork" in block)
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    told = re.findall(r"^    print\(.*#\s(.*)$", code, re.MULTILINE)
-    assert (done.returncode, done.stdout.splitlines()) == (0, told), done.stderr
-
-
 def test_named_paths_exist():
     """Each file and folder of the tree in the README is there."""
     tree = next(block for block in blocks("") if block.startswith("enact_dist/"))

@@ -1,4 +1,4 @@
-"""Check the models with Spin and print the table of the README.
+"""Check the models with Spin and print the table of enact_dist/docs/proof.md.
 
 `python tests/models/run.py` runs everything, `--model grace` one model, `--jobs 4` on more cores.
 """

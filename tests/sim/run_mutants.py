@@ -1,4 +1,4 @@
-"""Plant each wrong edit of the core in turn and show what catches it: the table of the README.
+"""Plant each wrong edit of the core in turn and show what catches it: the table of enact_dist/docs/proof.md.
 
 `python tests/sim/run_mutants.py` runs all of them, `… no_fence barges` some.
 """

@@ -243,7 +243,7 @@ OF_A_CONNECTION: Final[dict[str, Counter]] = {
     ),
     "payload_folders_elsewhere": Counter(
         "shards whose shared folder this process cannot see",
-        "for containers: mount one tmpfs in all of them, see Large data in the README",
+        "for containers: mount one tmpfs in all of them, see enact_dist/docs/large_data.md",
     ),
 }
 

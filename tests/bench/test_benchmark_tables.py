@@ -1,11 +1,11 @@
-"""The README's tables are written by one command, or nothing is."""
+"""The tables of the benchmarks page are written by one command, or nothing is."""
 
 import json
 
 import pytest
-from readme_tables import COLUMNS, NONE, main, measured, quoted
+from benchmark_tables import COLUMNS, NONE, main, measured, quoted
 
-README = """# Title
+PAGE = """# Title
 <!-- bench -->
 old
 <!-- end of bench -->
@@ -38,9 +38,9 @@ QUOTED = """
 
 @pytest.fixture
 def files(tmp_path):
-    """Return the README, a folder of results and a file to quote."""
-    readme, results, old = tmp_path / "README.md", tmp_path / "results", tmp_path / "of_2026.md"
-    readme.write_text(README)
+    """Return the page, a folder of results and a file to quote."""
+    page, results, old = tmp_path / "benchmarks.md", tmp_path / "results", tmp_path / "of_2026.md"
+    page.write_text(PAGE)
     old.write_text(QUOTED)
     results.mkdir()
     records = [
@@ -52,7 +52,7 @@ def files(tmp_path):
          "cpu_infra": 0.38, "missed": 0, "correct": False},
     ]  # fmt: skip
     (results / "redis.jsonl").write_text("\n".join(map(json.dumps, records)))
-    return readme, results, old
+    return page, results, old
 
 
 def column(cells, head):
@@ -84,11 +84,11 @@ def test_earlier_figures_are_quoted_with_their_units(files):
 
 def test_peers_are_written_between_their_markers(files):
     """What was measured comes first; a quoted row never hides a measured one."""
-    readme, results, old = files
+    page, results, old = files
 
-    assert main(["--peers", str(results), "--quote", str(old), "--readme", str(readme)]) == 0
+    assert main(["--peers", str(results), "--quote", str(old), "--page", str(page)]) == 0
 
-    text = readme.read_text()
+    text = page.read_text()
     assert "| redis-lua | 210 µs~ |" in text
     assert "| ray (quoted) | 4.04 ms |" in text
     assert "redis-lua (quoted)" not in text
@@ -98,38 +98,38 @@ def test_peers_are_written_between_their_markers(files):
 
 def test_earlier_figures_may_stand_alone(files):
     """Until the project itself was measured beside them."""
-    readme, _, old = files
+    page, _, old = files
 
-    assert main(["--quote", str(old), "--readme", str(readme)]) == 0
+    assert main(["--quote", str(old), "--page", str(page)]) == 0
 
-    assert "| redis-lua (quoted) | 204 µs |" in readme.read_text()
+    assert "| redis-lua (quoted) | 204 µs |" in page.read_text()
 
 
 def test_promises_are_told_in_words(files):
     """What nobody told is a dash."""
-    readme, results, _ = files
+    page, results, _ = files
 
-    assert main(["--peers", str(results), "--readme", str(readme)]) == 0
+    assert main(["--peers", str(results), "--page", str(page)]) == 0
 
-    (line,) = (line for line in readme.read_text().splitlines() if "redis-lua" in line)
+    (line,) = (line for line in page.read_text().splitlines() if "redis-lua" in line)
     assert line.endswith("| yes / - / - / - |")
 
 
 def test_nothing_is_written_if_anything_is_wrong(files, capsys):
     """Half a table is worse than the old one."""
-    readme, results, _ = files
+    page, results, _ = files
 
-    status = main(["none.json", "--peers", str(results), "--readme", str(readme)])
+    status = main(["none.json", "--peers", str(results), "--page", str(page)])
 
     assert status == 1
     assert "none.json cannot be read" in capsys.readouterr().err
-    assert readme.read_text() == README
+    assert page.read_text() == PAGE
 
 
 def test_readme_without_markers_is_refused(files, capsys):
     """The error says which lines it needs."""
-    readme, results, _ = files
-    readme.write_text("# Title\n")
+    page, results, _ = files
+    page.write_text("# Title\n")
 
-    assert main(["--peers", str(results), "--readme", str(readme)]) == 1
+    assert main(["--peers", str(results), "--page", str(page)]) == 1
     assert "<!-- peers -->" in capsys.readouterr().err

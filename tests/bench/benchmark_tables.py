@@ -1,9 +1,9 @@
-"""Write the performance tables of the README from what was measured: one command, nothing by hand.
+"""Write the performance tables of `enact_dist/docs/benchmarks.md` from what was measured: one command, nothing by hand.
 
     for n in 1 2 3; do enact bench --json > run$n.json; done
-    python tests/bench/readme_tables.py run1.json run2.json run3.json --peers results --quote old.md
+    python tests/bench/benchmark_tables.py run1.json run2.json run3.json --peers results --quote old.md
 
-The runs go between the README's `bench` markers, the peers between its `peers` markers.  RESULTS is
+The runs go between the page's `bench` markers, the peers between its `peers` markers.  RESULTS is
 the folder of the harness (`peer_enact.py` says how to fill it): one `.jsonl` file per peer.  Peers
 that were not measured anew are taken from a Markdown file of the same tables, and marked so.
 """
@@ -18,7 +18,7 @@ from enact_dist.bench.rows import shown_us
 from enact_dist.bench.tables import table
 from enact_dist.errors import MisuseError
 
-README = Path(__file__).parents[2] / "README.md"
+PAGE = Path(__file__).parents[2] / "enact_dist" / "docs" / "benchmarks.md"
 COLUMNS = (
     # Head, workload, variant, field; title and head of the same column in quoted tables.
     ("update", "W1_update", "1c_distinct", "p50_us", "W1", "1 client p50"),
@@ -134,7 +134,7 @@ def put(text, name, content):
     """
     begin, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
     if (text.count(begin), text.count(end)) != (1, 1) or text.index(begin) > text.index(end):
-        raise MisuseError(f"the README needs the lines {begin} and {end}, once each")
+        raise MisuseError(f"the page needs the lines {begin} and {end}, once each")
     before, rest = text.split(begin)
     return f"{before}{begin}\n{content}{end}{rest.split(end)[1]}"
 
@@ -145,21 +145,21 @@ def main(words):
     parser.add_argument("runs", nargs="*", type=Path, help="what `enact bench --json` printed")
     parser.add_argument("--peers", type=Path, metavar="RESULTS", help="folder of the harness")
     parser.add_argument("--quote", type=Path, metavar="FILE", help="Markdown of earlier figures")
-    parser.add_argument("--readme", type=Path, default=README)
+    parser.add_argument("--page", type=Path, default=PAGE)
     given = parser.parse_args(words)
     peers = given.peers is not None or given.quote is not None
     if not given.runs and not peers:
         parser.error("nothing to write: name runs, --peers, --quote or several of them")
     try:
-        text = given.readme.read_text()
+        text = given.page.read_text()
         if given.runs:
             text = put(text, "bench", table(given.runs))
         if peers:
             text = put(text, "peers", peers_table(given.peers, given.quote))
     except (MisuseError, OSError) as error:
-        print(f"readme_tables: {error}", file=sys.stderr)
+        print(f"benchmark_tables: {error}", file=sys.stderr)
         return 1
-    given.readme.write_text(text)
+    given.page.write_text(text)
     return 0
 
 
