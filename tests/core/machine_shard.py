@@ -17,6 +17,7 @@ from machine_messages import HOLDS, MS, TTLS, Pick, Plans
 from machine_pair import Pair
 from machine_staging import Staging
 
+from enact_dist.core.protocol.checks import wrong_decision
 from enact_dist.core.protocol.datum import LockId
 from enact_dist.core.protocol.messages import AwaitStamp, Finish, ListLocks, Survey
 from enact_dist.core.protocol.records import Called, Drain, SessionSeen, Tick
@@ -356,17 +357,29 @@ class ShardMachine(Staging, RuleBasedStateMachine):
         self.pair.give(message)
 
     def _consistent(self, event: str, lock: LockId, message: object) -> bool:
-        """Whether a repeated word of the far primary is still its word."""
+        """Whether a repeated word of the far primary is still its word, by a clock that agrees."""
         if event == "finish":
             assert isinstance(message, Finish)
-            return self.plans.far.get(lock) == message.position
+            return self._agrees(message) and self.plans.far.get(lock) == message.position
         if isinstance(message, Called) and event.startswith("told"):
             state, kind = self.reference.state_of(lock), message.answer.kind
             if kind == "committed":
-                return self.plans.far.get(lock) == message.answer.position
+                told = self.plans.far.get(lock) == message.answer.position
+                return told and self._agrees(message.answer)
             if kind == "aborted":
                 return self.plans.far.get(lock) is None and (state, event) not in UNREACHABLE
         return True
+
+    def _agrees(self, told) -> bool:
+        """Whether the shard can take this stamp: a clock set back before a restart forbids it.
+
+        `test_far_stamps.py` shows what the shard answers where it cannot.
+        """
+        pair, lock = self.pair, LockId("", 0, 0)
+        stamps = pair.shard.state.stamps
+        refused = wrong_decision(lock, told.position, stamps, wall_ns=pair.wall_ns)
+        self.coverage.tally["stamps from far ahead"] += refused is not None
+        return refused is None
 
     def _hit_view(self, message) -> None:
         lowest = {view.lane: view.seq for view in message.view}

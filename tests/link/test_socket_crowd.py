@@ -97,12 +97,12 @@ def test_shard_keeps_nothing_of_clients_that_come_and_go(raw, until):
         slowest_s = max(slowest_s, time.monotonic() - began_s)
     near.close()
 
-    until(lambda: service._count == 0)
+    until(lambda: not [t for t in threading.enumerate() if t.name == "enact-socket"])
     until(lambda: not shard.host._replies)
+    assert service._count == 0
     assert service._connections == {}
     assert service._watchers == ()
     assert all(not watched.connections for watched in service._deaths._watched.values())
-    until(lambda: not [t for t in threading.enumerate() if t.name == "enact-socket"])
     assert shard.host.failure is None
     assert counters(shard)["connections_refused"] > 0
     assert slowest_s < 30.0
