@@ -1,11 +1,16 @@
 """The pages of `enact_dist/docs` are true: their programs run, their links lead somewhere."""
 
+import ast
 import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from enact_dist.config import environment
+from enact_dist.config.read import load_config
+from enact_dist.config.shows import SHOWS_KEYS
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted((ROOT / "enact_dist" / "docs").glob("*.md"))
@@ -56,3 +61,34 @@ def test_readme_leads_to_each_page():
     """No reader finds a page that nothing leads to."""
     readme = (ROOT / "README.md").read_text("utf-8")
     assert [page.name for page in PAGES if f"enact_dist/docs/{page.name}" not in readme] == []
+
+
+def test_page_of_cell_toml_has_every_key_and_no_other():
+    """Its tables name what the reader accepts, table by table and in any order."""
+    page = (ROOT / "enact_dist" / "docs" / "cell.md").read_text("utf-8")
+    tables = re.findall(r"^\| key .*\n\|---.*\n((?:\|.*\n)+)", page, re.MULTILINE)
+    explained = [set(re.findall(r"^\| `(\w+)` \|", rows, re.MULTILINE)) for rows in tables]
+    source = (ROOT / "enact_dist" / "config" / "read.py").read_text("utf-8")
+    accepted = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "refuse_unknown":
+            keys = {arg.value for arg in node.args if isinstance(arg, ast.Constant)}
+            starred = any(isinstance(arg, ast.Starred) for arg in node.args)
+            accepted.append(keys | (set(SHOWS_KEYS) if starred else set()))
+    lists = {"shards", "pins", "aspects", "actors"}  # headings of the page
+    assert sorted(map(sorted, explained)) == sorted(sorted(keys - lists) for keys in accepted)
+
+    variables = set(re.findall(r"^\| `(ENACT_\w+)` \|", page, re.MULTILINE))
+    of_shards = {environment.variable_of("name", key) for key in environment._SHARD_KEYS}
+    of_cell = set(environment._CELL_NAMES) - {"ENACT_SHARED_FOLDER"}  # no key of the file
+    assert variables == of_cell | of_shards
+
+
+def test_example_of_cell_toml_is_read(tmp_path):
+    """What the page shows is a cell."""
+    page = (ROOT / "enact_dist" / "docs" / "cell.md").read_text("utf-8")
+    [text] = re.findall(r"^```toml\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
+    (tmp_path / "cell.toml").write_text(text, "utf-8")
+    config = load_config(tmp_path / "cell.toml", environment={})
+    assert [shard.name for shard in config.shards] == ["vision", "robot"]
+    assert [actor.name for actor in config.actors] == ["camera", "detector"]

@@ -27,71 +27,12 @@ Example::
     worlds = { training = "training", online = "online" }
     options = { voxel_m = 0.002 }
 
-=====================  =============  =====================================================
-key                    default        meaning
-=====================  =============  =====================================================
-name                   required       cell name, part of every key on the network
-worlds                 []             world contexts that exist from the start
-session_ttl_s          2.0            a holder that dies loses its locks after this, seconds
-                                      (0.2 to 60)
-data_folder            none           parent of the shards' folders; without one, and without
-                                      a `folder`, a shard keeps everything in memory only
-carrier                "auto"         how messages travel between processes: "zenoh"; "socket"
-                                      (of this host, an error elsewhere); "auto" takes sockets
-                                      where it can
-shared_bytes_max       none           cap of each shard's large data in the memory that is
-                                      shared on its host, bytes: beyond, history goes, then
-                                      writes are refused; without one, half of that memory is
-                                      used and what is beyond travels; 0: none is shared
-[shards.NAME]          at least one   a shard daemon
-  listen               required       endpoint or endpoints it opens, ``tcp/host:port``
-  advertise            listen         endpoint or endpoints at which others reach it; required
-                                      where `listen` is a wildcard address
-  folder               data_folder/   its data folder
-                       NAME
-  host                 this machine   host name of the machine that runs it
-  metrics              none           ``host:port``, or a port of the loopback, at which
-                                      Prometheus may ask for `/metrics` (deploy/metrics.md)
-  drain_s              0.8            how long holders of locks may still finish after SIGTERM,
-                                      seconds (0 to 3600); a process manager must wait longer
-[[pins]]               none           entities kept on one shard; the first match wins
-  entities             required       name pattern, ``tray/**``
-  shard                required       name of a shard
-[aspects.NAME]         none           an aspect that the cell configures
-  durability           the actors'    "durable", "os" or "volatile"; default: "durable"
-  retention            the actors'    how much of each datum's history stays: a number of
-                                      versions, the newest included (1: none), or a table of
-                                      `versions`, `age_s` (since it was replaced) and `size_bytes`
-                                      (replaced data per datum); a key left out means no limit;
-                                      default: 16 versions, 600 s, 16 MiB
-  compare              none           what `enact world diff` compares its data by,
-                                      ``package.module:NAME``: the `Aspect` that says it (then its
-                                      type is known, too), or a comparator
-  shows                guessed        what a recording shows the data as, one kind or several, with
-  frame, parent,                      their coordinate frames: see `enact_dist.config.shows`
-  of, encoding, …
-[actors.NAME]          none           an actor process
-  class                required       ``package.module:Class``
-  worlds               {}             role of the class = world context of the cell
-  args                 {}             parameters of the class: of its `__init__`, or attributes that
-                                      the class annotates and gives a value; `enact actor set`
-                                      changes attributes while the actor runs
-  options              {}             the older name for those of `__init__`
-  env                  {}             environment variables of its process, texts
-  process              its own        name of the process that it shares with all actors of the
-                                      same `process`, each in a thread with a session of its own:
-                                      see `enact_dist.actor.running.group`
-  every_s              the class's    period of a source, seconds
-  entity               all            the one entity that it works on, of those that the patterns
-                                      of its class match: one class for several cameras
-  host                 this machine   host name of the machine that runs it
-  drain_s              8              how long its update may still take after SIGTERM, seconds
-=====================  =============  =====================================================
+`enact_dist/docs/cell.md` explains every key.
 
 A cell.toml is a program: the modules that it names run as the user who starts it.  They are looked
 up beside the file first, the working folder comes last.  Relative folders are relative to the file.
-An unknown key, a wrong type or a name that does not
-exist is a `ConfigError` with file, line and, where one is close, a suggestion.  The environment
+An unknown key, a wrong type or a name that does not exist is a `ConfigError` with file, line and,
+where one is close, a suggestion.  The environment
 overrides the file: see `enact_dist.config.environment`.
 """
 
