@@ -2,9 +2,10 @@
 
 A commit over shards stands when one of them has decided; each other one shows its part when its
 own disk has kept that, and tells of it then.  So the shards are asked whether they show everything
-up to the newest stamp that was told, and what is told until a rest after that is recorded.  A shard
-that does not answer, or that is slower than `SHOWN_S`, is not waited for: what has to be fetched is
-remembered for 2 s only.
+up to the newest stamp that was told, and what is told until a rest after that is recorded.  While a
+recording goes on it does not wait for a shard that does not answer, or that is slower than
+`SHOWN_S`: what has to be fetched is remembered for 2 s only.  At its begin and end it asks such a
+shard again until the time is over, since a busy host may delay one answer.
 """
 
 from __future__ import annotations
@@ -69,11 +70,16 @@ class Settling:
         gives_up_s = time.monotonic() + wait_s
         with contextlib.suppress(LinkError):  # a shard is away
             stamp_ns = stamp_ns or present_ns(self._client)
-            while not self._all_show(stamp_ns) and time.monotonic() < gives_up_s:
-                pass
+            while not self._all_show(stamp_ns, absent=False) and time.monotonic() < gives_up_s:
+                time.sleep(ASK_S)  # the address of a shard that is away refuses at once
 
-    def _all_show(self, stamp_ns: int) -> bool:
-        """Whether every shard that answers shows all that is committed up to a stamp."""
+    def _all_show(self, stamp_ns: int, *, absent: bool = True) -> bool:
+        """Whether every shard shows all that is committed up to a stamp.
+
+        Args:
+            stamp_ns: The stamp.
+            absent: What counts for a shard that does not answer.
+        """
         session, wait_ns = self._client.core.session, int(ASK_S * 1e9)
         try:
             answers = self._client.ask_each(
@@ -83,4 +89,6 @@ class Settling:
             )
         except LinkError:
             return True
-        return all(answer.reached for answer in answers.values() if isinstance(answer, Reached))
+        return all(
+            answer.reached if isinstance(answer, Reached) else absent for answer in answers.values()
+        )

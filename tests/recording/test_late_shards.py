@@ -76,7 +76,7 @@ def test_shard_that_shows_nothing_any_more_is_not_waited_for_long(late_cell, mon
     """What is in doubt for good ends no recording, and what else is committed is recorded."""
     monkeypatch.setattr(settling, "SHOWN_S", 0.2)
     resting = settling.Settling(late_cell._client)
-    monkeypatch.setattr(resting, "_all_show", lambda _: False)
+    monkeypatch.setattr(resting, "_all_show", lambda _, **__: False)
 
     resting.told(7)
     ends_s = time.monotonic() + 60.0
