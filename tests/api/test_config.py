@@ -432,7 +432,7 @@ def test_example_of_the_docstring_is_a_valid_cell():
 
     import enact_dist.config.read as module
 
-    example = module.__doc__.split("Example::")[1].split("=====")[0]
+    example = module.__doc__.split("Example::")[1].split("`enact_dist/docs")[0]
 
     config = parsed(textwrap.dedent(example))
 
