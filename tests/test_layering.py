@@ -38,20 +38,10 @@ UPWARD = {
     "cli/bench.py -> bench",  # a verb loads what measures at use
     "cli/verify.py -> verify",
     "compare/diff.py -> world",
-    "compare/two_worlds.py -> world",
-    "core/protocol/checks.py -> core.state",
 }
 """Imports that lead up.  This list, and those below, can only shrink: the tests compare exactly."""
 CIRCLES: dict[str, int] = {
-    "actors/geometry/agreement.py": 2,
-    "actors/palletizing/demo_packing.py": 2,
-    "actors/palletizing/finger_room.py": 2,
-    "enact_dist/access/each.py": 2,
     "enact_dist/access/session.py": 3,
-    "enact_dist/bench/command.py": 2,
-    "enact_dist/bench/palletizing.py": 2,
-    "enact_dist/compare/diff.py": 3,
-    "enact_dist/operate/doctor.py": 2,
     "enact_dist/verify/simulation/captures.py": 15,
     "enact_dist/world/context.py": 2,
 }

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
-    from actors.geometry.recordings import RecordedFrame
+    from actors.geometry.shapes import RecordedFrame
+
 
 UNITS: Final = {0.1: "tenths of millimetres", 0.2: "fifths of millimetres (TUM)", 10.0: "cm"}
 """Other units in use, as millimetres per step."""

@@ -23,7 +23,7 @@ import numpy as np
 from actors.geometry.agreement import check_agreement
 from actors.geometry.calibration import read_intrinsics, read_trajectory
 from actors.geometry.files import InputFileError, existing_file
-from actors.geometry.shapes import Acquisition, DepthFrame
+from actors.geometry.shapes import Acquisition, DepthFrame, RecordedFrame
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -48,32 +48,6 @@ DEPTH_MM_FARTHEST: Final = 20_000
 
 FRAMES_MAX: Final = 3_000
 """1.5 MB each in memory at 640 x 480: a longer recording is to be thinned, not to fill 5 GB."""
-
-
-@dataclass(frozen=True, slots=True)
-class RecordedFrame:
-    """One shot of the camera.
-
-    Attributes:
-        name: File name of the depth image.
-        depth: Depth in millimetres with camera and pose, world frame of the trajectory.
-        colour: RGB, uint8, (H, W, 3), registered to the depth image.
-    """
-
-    name: str
-    depth: DepthFrame
-    colour: npt.NDArray[np.uint8]
-
-    @property
-    def world_from_camera(self) -> npt.NDArray[np.float64]:
-        """Pose of the camera, (4, 4), metres."""
-        return self.depth.acquisition.world_from_camera
-
-    @property
-    def median_m(self) -> float:
-        """Median of what was measured, metres along the optical axis."""
-        depth_mm = self.depth.depth_mm
-        return float(np.median(depth_mm[depth_mm > 0])) / 1000.0
 
 
 @dataclass(frozen=True, slots=True)

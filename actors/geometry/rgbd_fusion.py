@@ -25,8 +25,7 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
-    from actors.geometry.recordings import RecordedFrame
-    from actors.geometry.shapes import Camera
+    from actors.geometry.shapes import Camera, RecordedFrame
 
     Floats = npt.NDArray[np.float64]
     Colours = npt.NDArray[np.uint8]

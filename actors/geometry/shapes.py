@@ -179,3 +179,29 @@ class Surface:
             patch_of_vertex=np.full(len(vertices_m), FREE_FORM, np.int32),
             patch_planes=np.empty((0, 4)),
         )
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedFrame:
+    """One shot of the camera.
+
+    Attributes:
+        name: File name of the depth image.
+        depth: Depth in millimetres with camera and pose, world frame of the trajectory.
+        colour: RGB, uint8, (H, W, 3), registered to the depth image.
+    """
+
+    name: str
+    depth: DepthFrame
+    colour: npt.NDArray[np.uint8]
+
+    @property
+    def world_from_camera(self) -> npt.NDArray[np.float64]:
+        """Pose of the camera, (4, 4), metres."""
+        return self.depth.acquisition.world_from_camera
+
+    @property
+    def median_m(self) -> float:
+        """Median of what was measured, metres along the optical axis."""
+        depth_mm = self.depth.depth_mm
+        return float(np.median(depth_mm[depth_mm > 0])) / 1000.0

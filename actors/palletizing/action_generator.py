@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 from actors.palletizing.controller import open_controller
 from actors.palletizing.expectation import Expectations
+from actors.palletizing.finger_room import Gripper
 from actors.palletizing.grasps import size_of
-from actors.palletizing.grounding import Gripper, aside_net
+from actors.palletizing.grounding import aside_net
 from actors.palletizing.handling import (
     ASIDE,
     IDLE,
@@ -54,7 +55,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from actors.palletizing.controller import ArmController
-    from actors.palletizing.grounding import Beside
+    from actors.palletizing.finger_room import Beside
     from actors.palletizing.vocabulary import Attached, Request
     from enact_dist import Lock
 

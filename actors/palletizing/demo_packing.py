@@ -22,14 +22,13 @@ import contextlib
 import importlib.util
 import sys
 import time
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from actors.geometry.files import write_whole
 from actors.palletizing.controller import ControllerError
 from actors.palletizing.demo import watch_demo
 from actors.palletizing.demo_lineage import show_packing
-from actors.palletizing.demo_packing_files import files_of
+from actors.palletizing.demo_packing_files import Seen, files_of
 from actors.palletizing.demo_packing_report import (
     judged_by,
     report_bytes,
@@ -56,7 +55,6 @@ from actors.palletizing.vocabulary import (
     SYSTEM,
     USER,
     VIEWS,
-    Result,
 )
 from actors.running_cell import DemoError, recording, until_interrupted
 from enact_dist import View, ViewEach
@@ -72,7 +70,7 @@ if TYPE_CHECKING:
 
     from actors.palletizing.demo_packing_report import Row
     from actors.palletizing.demo_robot_cell import RobotCell
-    from actors.palletizing.vocabulary import Deviation, Notice, Plan
+    from actors.palletizing.vocabulary import Notice, Plan
     from enact_dist import Cell
 
     Picture = npt.NDArray[np.uint8]
@@ -85,30 +83,6 @@ SEED: Final = 59
 SPEED: Final = 1.25
 """Simulated seconds per second: what two cores can do beside all actors."""
 PICTURE_PX: Final = (960, 720)
-
-
-@dataclass(slots=True)
-class Seen:
-    """What was seen while a run went on.
-
-    Attributes:
-        results: What became of each package, by place.
-        flags: The last verdicts, by place.
-        judged: The truth when each of them was given.
-        pictures: The cell, drawn by MuJoCo, by name of the file.
-        undrawn: Why it could not be drawn.
-        started_s: When the first package had come; 0: it has not.
-        started_sim_ns: The same in simulated time.
-        figures: What was measured.
-    """
-
-    results: Mapping[str, Result] = field(default_factory=dict)
-    flags: Mapping[str, Deviation] = field(default_factory=dict)
-    judged: dict[str, tuple[str, str]] = field(default_factory=dict)
-    pictures: dict[str, Picture] = field(default_factory=dict)
-    undrawn: str = ""
-    started_s: float = 0.0
-    figures: dict[str, object] = field(default_factory=dict)
 
 
 def run_packing(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from actors.geometry.picture import png_bytes
@@ -30,17 +31,42 @@ from enact_dist.actor.drawing.svg import svg_of
 from enact_dist.config.read import load_config
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     import numpy as np
     import numpy.typing as npt
 
-    from actors.palletizing.demo_packing import Seen
+    from actors.palletizing.vocabulary import Deviation, Result
     from enact_dist import Cell
 
     Picture = npt.NDArray[np.uint8]
 
 _NO_NAME: Final = re.compile(r"[^A-Za-z0-9_-]")
+
+
+@dataclass(slots=True)
+class Seen:
+    """What was seen while a run went on.
+
+    Attributes:
+        results: What became of each package, by place.
+        flags: The last verdicts, by place.
+        judged: The truth when each of them was given.
+        pictures: The cell, drawn by MuJoCo, by name of the file.
+        undrawn: Why it could not be drawn.
+        started_s: When the first package had come; 0: it has not.
+        started_sim_ns: The same in simulated time.
+        figures: What was measured.
+    """
+
+    results: Mapping[str, Result] = field(default_factory=dict)
+    flags: Mapping[str, Deviation] = field(default_factory=dict)
+    judged: dict[str, tuple[str, str]] = field(default_factory=dict)
+    pictures: dict[str, Picture] = field(default_factory=dict)
+    undrawn: str = ""
+    started_s: float = 0.0
+    figures: dict[str, object] = field(default_factory=dict)
 
 
 def files_of(

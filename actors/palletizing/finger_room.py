@@ -8,25 +8,22 @@ Rule a change must keep: the grasp that a request begins with is that of all its
 package is put down as it was taken.
 """
 
-from __future__ import annotations
+# The wire reads these annotations: they stay real types, without `from __future__`.
 
-from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
 from actors.geometry.poses import inverse
 from actors.geometry.poses import on_tray as pose_on_tray
 from actors.palletizing.rows import RIM_M, TRAY_HALF_M
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    import numpy.typing as npt
-
-    from actors.palletizing.grounding import Beside, Grasp, Gripper
-
-    F64 = npt.NDArray[np.float64]
+F64 = npt.NDArray[np.float64]
+Beside = tuple[tuple[str, F64, F64], ...]
+"""Entity, where it stands, and the box of each other package, see `grounding.Job`."""
 
 REGRASP_OPEN_M: Final = 0.014
 """So much wider than the package the hand opens where others stand, see skeletons/regrasp.toml."""
@@ -44,6 +41,54 @@ LINE_N: Final = 25.0
 """Of fingers on less: a rim, a round wall, the edge of a face, which would give way."""
 RIM_THICK_M: Final = 0.007
 """Thickness of the tray's rim, with what it is off."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Grasp:
+    """Where and how a product is held (product/*).
+
+    Attributes:
+        point: (3,) float64, metres, product frame: the middle between the fingers.
+        axis: (3,) float64, unit vector, level, product frame: from one finger to the other.
+        width_m: Between the fingers that hold it.
+        force_n: Of the fingers.
+        push_height_m: Above the product's base, where a push does not tip it.
+        mass_kg: Of the product.
+    """
+
+    point: npt.NDArray[np.float64]
+    axis: npt.NDArray[np.float64]
+    width_m: float
+    force_n: float
+    push_height_m: float
+    mass_kg: float
+
+
+@dataclass(frozen=True, slots=True)
+class Gripper:
+    """What a parallel gripper can do; by default a stroke of 70 mm from 65 mm on.
+
+    Attributes:
+        least_m: Between the closed fingers.
+        most_m: Between the open fingers.
+        play_m: So much wider than a package it opens at least.
+        force_n_max: Of the fingers.
+        payload_kg: Greatest mass of what it holds.
+        mass_kg: Its own, which the arm carries as well.
+        half_m: Half the hand along the fingers' way when it is closed.
+        half_across_m: Half the fingers across it.
+        tips_m: So far do the fingers reach beyond the tool.
+    """
+
+    least_m: float = 0.065
+    most_m: float = 0.135
+    play_m: float = 0.010
+    force_n_max: float = 60.0
+    payload_kg: float = 2.0
+    mass_kg: float = 1.0
+    half_m: float = 0.0445
+    half_across_m: float = 0.012
+    tips_m: float = 0.020
 
 
 def open_m(grasp: Grasp, gripper: Gripper, *, on_belt: bool) -> float:

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from actors.palletizing.finger_room import FLAT_M2, LINE_N
-from actors.palletizing.grounding import Grasp, Gripper
+from actors.palletizing.finger_room import FLAT_M2, LINE_N, Grasp, Gripper
 
 if TYPE_CHECKING:
     import numpy.typing as npt

@@ -43,6 +43,7 @@ from actors.geometry.joint_paths import Arm
 from actors.geometry.poses import inverse, roll_pitch_yaw, turned
 from actors.geometry.reaching import reach
 from actors.palletizing import finger_room
+from actors.palletizing.finger_room import Beside, Grasp, Gripper
 from actors.palletizing.net_files import net_of_document, read_document
 from actors.palletizing.nets import Net, NetError, Primitive
 from actors.palletizing.skeleton_files import bind
@@ -50,8 +51,6 @@ from actors.palletizing.skeleton_files import bind
 F64 = npt.NDArray[np.float64]
 Frames = Callable[[str], F64]
 Value = str | float | F64
-Beside = tuple[tuple[str, F64, F64], ...]
-"""Entity, where it stands, and the box of each other package, see `Job.beside`."""
 
 FOLDER: Final = Path(__file__).parent / "skeletons"
 SKELETONS: Final = tuple(sorted(file.stem for file in FOLDER.glob("*.toml")))
@@ -69,54 +68,6 @@ TAKING: Final = ("grasp_from_belt", "regrasp")
 """Skeletons that take a package with open fingers."""
 SQUEEZE_M: Final = 0.006
 """So much less or more than its width a package between the fingers measures at most."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Grasp:
-    """Where and how a product is held (product/*).
-
-    Attributes:
-        point: (3,) float64, metres, product frame: the middle between the fingers.
-        axis: (3,) float64, unit vector, level, product frame: from one finger to the other.
-        width_m: Between the fingers that hold it.
-        force_n: Of the fingers.
-        push_height_m: Above the product's base, where a push does not tip it.
-        mass_kg: Of the product.
-    """
-
-    point: npt.NDArray[np.float64]
-    axis: npt.NDArray[np.float64]
-    width_m: float
-    force_n: float
-    push_height_m: float
-    mass_kg: float
-
-
-@dataclass(frozen=True, slots=True)
-class Gripper:
-    """What a parallel gripper can do; by default a stroke of 70 mm from 65 mm on.
-
-    Attributes:
-        least_m: Between the closed fingers.
-        most_m: Between the open fingers.
-        play_m: So much wider than a package it opens at least.
-        force_n_max: Of the fingers.
-        payload_kg: Greatest mass of what it holds.
-        mass_kg: Its own, which the arm carries as well.
-        half_m: Half the hand along the fingers' way when it is closed.
-        half_across_m: Half the fingers across it.
-        tips_m: So far do the fingers reach beyond the tool.
-    """
-
-    least_m: float = 0.065
-    most_m: float = 0.135
-    play_m: float = 0.010
-    force_n_max: float = 60.0
-    payload_kg: float = 2.0
-    mass_kg: float = 1.0
-    half_m: float = 0.0445
-    half_across_m: float = 0.012
-    tips_m: float = 0.020
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -26,8 +26,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from actors.palletizing.finger_room import open_m
-from actors.palletizing.grounding import PUSH_GAP_M, Gripper, Job, easier_turn, ground
+from actors.palletizing.finger_room import Gripper, open_m
+from actors.palletizing.grounding import PUSH_GAP_M, Job, easier_turn, ground
 from actors.palletizing.nets import NetError
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from actors.geometry.joint_paths import Arm
-    from actors.palletizing.grounding import Beside, Grasp
+    from actors.palletizing.finger_room import Beside, Grasp
     from actors.palletizing.nets import Net
     from actors.palletizing.vocabulary import (
         GripCommand,

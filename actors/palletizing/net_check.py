@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from actors.palletizing.grounding import Grasp, Gripper, Job, parameters
+from actors.palletizing.finger_room import Grasp, Gripper
+from actors.palletizing.grounding import Job, parameters
 from actors.palletizing.net_files import net_of_document, read_document
 from actors.palletizing.net_picture import svg_of_net
 from actors.palletizing.skeleton_files import bind

@@ -5,9 +5,8 @@
 
 It does what the actors do, with the same functions, as fast as it goes: a package arrives, the belt
 sensor sees it, nets are grounded and executed, the hand goes aside, the tray sensor looks, every
-place whose neighbourhood has changed is judged, and what was seen decides what follows.
-
-One thing differs: the operator is a rule.
+place whose neighbourhood has changed is judged, and what was seen decides what follows.  Only the
+operator differs: here he is a rule.
 
 Rules a change must keep: decisions see pictures and measurements only, never the truth of physics;
 truth is noted beside each verdict, for the score (`packing_scores`).
@@ -25,8 +24,9 @@ from actors.geometry.depth import fused
 from actors.geometry.poses import coordinates, inverse
 from actors.palletizing.belt_sight import BeltWatch
 from actors.palletizing.execution import Executor
+from actors.palletizing.finger_room import Gripper
 from actors.palletizing.grasps import grasp_of, size_of
-from actors.palletizing.grounding import Gripper, Job, aside_net, easier_turn, ground
+from actors.palletizing.grounding import Job, aside_net, easier_turn, ground
 from actors.palletizing.handling import felt, felt_on, fills, gap_before
 from actors.palletizing.nets import NetError
 from actors.palletizing.packing_records import Judgement, Packed, Step

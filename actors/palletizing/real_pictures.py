@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from actors.geometry.coloured_surface import ColouredSurface
     from actors.geometry.matching import ModelMatch
     from actors.geometry.pointcloud_files import CloudFile
-    from actors.geometry.recordings import RecordedFrame, Recording
+    from actors.geometry.recordings import Recording
+    from actors.geometry.shapes import RecordedFrame
 
     Floats = npt.NDArray[np.floating[Any]]
     Picture = npt.NDArray[np.uint8]

@@ -19,9 +19,9 @@ import numpy as np
 
 from actors.geometry.coloured_surface import ColouredSurface
 from actors.geometry.depth import depth_of_points, metres, millimetres, points_grid
-from actors.geometry.recordings import RecordedFrame, read_recording
+from actors.geometry.recordings import read_recording
 from actors.geometry.rgbd_fusion import fuse_frames, natural_voxel_m
-from actors.geometry.shapes import DepthFrame, PointCloud
+from actors.geometry.shapes import DepthFrame, PointCloud, RecordedFrame
 from actors.palletizing.vocabulary import (
     CLOUD,
     SCAN,

@@ -38,7 +38,7 @@ import numpy.typing as npt
 from actors.comparators import CloudDistance, SurfaceDistance
 from actors.geometry.deviation import Limits
 from actors.geometry.shapes import Acquisition, DepthFrame, PointCloud, Surface
-from actors.palletizing.grounding import Grasp
+from actors.palletizing.finger_room import Grasp
 from actors.palletizing.handling_data import Arrival as Arrival  # noqa: PLC0414
 from actors.palletizing.handling_data import Attached as Attached  # noqa: PLC0414
 from actors.palletizing.handling_data import Candidate as Candidate  # noqa: PLC0414

@@ -1,13 +1,9 @@
-"""The writable data of a pattern: what `lock[WriteEach(…)]` is.
-
-One class in two parts with `Lock`, whose writes it fills.
-"""
-# ruff: noqa: SLF001 - see above
+"""The writable data of a pattern: what `lock[WriteEach(…)]` is."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, MutableMapping
-from typing import TYPE_CHECKING, TypeVar, overload
+from collections.abc import Callable, Iterator, MutableMapping
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, overload
 
 from enact_dist.access.reads import EachData, Readings
 from enact_dist.access.writes import Asked
@@ -17,11 +13,28 @@ from enact_dist.patterns import pattern_matches
 from enact_dist.terms import Entity
 
 if TYPE_CHECKING:
-    from enact_dist.access.lock import Lock
-    from enact_dist.access.writes import DTypesLike, ShapesLike
-    from enact_dist.terms import LockRequest
+    from enact_dist.access.writes import DTypesLike, ShapesLike, Writing
+    from enact_dist.terms import Aspect, LockRequest
 
 T = TypeVar("T")
+
+
+class Block(NamedTuple):
+    """What the data of a pattern need of the lock that holds them.
+
+    Attributes:
+        writing: The lock's writes, which they add to.
+        use: Raises unless the block is running and the lock not known to be lost.
+        put: Sets a slot to a value of an aspect with a capture stamp.
+        stamp: Returns the capture stamp that holds where the program names none.
+        shard_of: Returns the shard that owns a slot.
+    """
+
+    writing: Writing
+    use: Callable[[], None]
+    put: Callable[[Slot, Aspect[Any], Any, int | None], None]
+    stamp: Callable[[int | None], int]
+    shard_of: Callable[[Slot], str]
 
 
 class WritableEach(EachData[T], MutableMapping[Entity, T]):
@@ -31,18 +44,18 @@ class WritableEach(EachData[T], MutableMapping[Entity, T]):
     process can have created it.
     """
 
-    def __init__(self, lock: Lock, readings: Readings, request: LockRequest[T]) -> None:
+    def __init__(self, block: Block, readings: Readings, request: LockRequest[T]) -> None:
         super().__init__(readings, request)
-        self._lock = lock
+        self._block = block
         self._followed = 0
 
     def follow(self) -> None:
         """Take over what was set through other requests of the lock since the last look."""
-        if self._followed == self._lock._writing.edits:
+        if self._followed == self._block.writing.edits:
             return
-        self._followed = self._lock._writing.edits
+        self._followed = self._block.writing.edits
         context, pattern, aspect = self._request.address
-        for slot, datum in self._lock._writing.data.items():
+        for slot, datum in self._block.writing.data.items():
             same = (slot.context, slot.aspect) == (context, aspect)
             if same and pattern_matches(pattern, slot.entity):
                 self._note(Entity(slot.entity), slot, null=datum is None)
@@ -65,8 +78,9 @@ class WritableEach(EachData[T], MutableMapping[Entity, T]):
         slot = self._slots.get(entity)
         if slot is None:
             raise KeyError(entity)
-        if slot in self._lock._writing.data:
-            return self._lock._written(slot, self._request.aspect)
+        if slot in self._block.writing.data:
+            value: T = self._block.writing.written(slot, self._request.aspect)
+            return value
         return super().__getitem__(entity)
 
     def __setitem__(self, entity: Entity, datum: T) -> None:
@@ -76,10 +90,10 @@ class WritableEach(EachData[T], MutableMapping[Entity, T]):
         """Set one entity's datum when the block ends cleanly; see `Lock.put`."""
         self.follow()
         slot = self._slot(entity)
-        self._lock._use()
-        self._lock._put(slot, self._request.aspect, datum, stamp_ns)
+        self._block.use()
+        self._block.put(slot, self._request.aspect, datum, stamp_ns)
         self._note(entity, slot, null=False)
-        self._followed = self._lock._writing.edits
+        self._followed = self._block.writing.edits
 
     @overload
     def new(
@@ -104,13 +118,13 @@ class WritableEach(EachData[T], MutableMapping[Entity, T]):
         """Return one entity's datum, whose arrays are to be filled in place; see `Lock.new`."""
         self.follow()
         slot = self._slot(entity)
-        self._lock._use()
+        self._block.use()
         asked = Asked(
-            self._request.aspect.datum_type, like, shape, dtype, self._lock._stamp(stamp_ns)
+            self._request.aspect.datum_type, like, shape, dtype, self._block.stamp(stamp_ns)
         )
-        value: T = self._lock._writing.new(slot, asked, self._lock._shard)
+        value: T = self._block.writing.new(slot, asked, self._block.shard_of)
         self._note(entity, slot, null=False)
-        self._followed = self._lock._writing.edits
+        self._followed = self._block.writing.edits
         return value
 
     def __delitem__(self, entity: Entity) -> None:
@@ -118,10 +132,10 @@ class WritableEach(EachData[T], MutableMapping[Entity, T]):
         if entity not in self._slots:
             raise KeyError(entity)
         slot = self._slot(entity)
-        self._lock._use()
-        self._lock._writing.delete(slot)
+        self._block.use()
+        self._block.writing.delete(slot)
         self._note(entity, slot, null=True)
-        self._followed = self._lock._writing.edits
+        self._followed = self._block.writing.edits
 
     def __iter__(self) -> Iterator[Entity]:
         return iter(list(self._slots))

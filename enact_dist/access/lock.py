@@ -16,13 +16,12 @@ import time
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 from enact_dist.access.arguments import check_seconds
-from enact_dist.access.each import WritableEach
+from enact_dist.access.each import Block, WritableEach
 from enact_dist.access.reads import (
     EachData,
     Readings,
     check_requested,
     misfit,
-    null_error,
     refuse_changed,
     slot_of,
 )
@@ -272,7 +271,7 @@ class Lock(Triggered):
 
     def _value(self, slot: Slot, request: Any) -> Any:
         if slot in self._writing.data:
-            return self._written(slot, request.aspect)
+            return self._writing.written(slot, request.aspect)
         return self._readings.value(slot, request.aspect)
 
     def _each_data(self, request: LockRequest[T]) -> EachData[T]:
@@ -281,7 +280,7 @@ class Lock(Triggered):
         if data is None:
             writable = request.access is Access.WRITE_EACH
             data = (
-                WritableEach(self, self._readings, request)
+                WritableEach(self._block(), self._readings, request)
                 if writable
                 else EachData(self._readings, request)
             )
@@ -289,6 +288,9 @@ class Lock(Triggered):
         if isinstance(data, WritableEach):
             data.follow()
         return data
+
+    def _block(self) -> Block:
+        return Block(self._writing, self._use, self._put, self._stamp, self._shard)
 
     @overload
     def get(self, request: LockRequestOne[T]) -> T | None: ...
@@ -312,13 +314,6 @@ class Lock(Triggered):
             return self._writing.data[slot] is None
         state = self._readings.state(slot)
         return state is None or bool(state.null_reason)
-
-    def _written(self, slot: Slot, aspect: Aspect[T]) -> T:
-        datum = self._writing.data[slot]
-        if datum is None:
-            raise null_error(slot, None)
-        value: T = self._writing.value(slot, datum, aspect.datum_type)
-        return value
 
     def __setitem__(self, request: Write[T], datum: T) -> None:
         """Set the datum when the block ends cleanly; see `put`."""

@@ -24,7 +24,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
 
-from enact_dist.access.reads import Shown, changeable, misfit, slot_of
+from enact_dist.access.reads import Shown, changeable, misfit, null_error, slot_of
 from enact_dist.core.protocol.datum import Datum, Slot
 from enact_dist.core.protocol.messages import WriteItem
 from enact_dist.core.protocol.parts import READS_MAX
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from enact_dist.access.reads import EachData, Readings
     from enact_dist.core.protocol.datum import Slot
     from enact_dist.core.protocol.messages import DatumRead
-    from enact_dist.terms import LockRequest
+    from enact_dist.terms import Aspect, LockRequest
 
 
 def reads_of(
@@ -151,8 +151,15 @@ class Writing:
         size = self._size_with(slot, encoded.size)
         self._note(slot, self._written(slot, encoded, shard_of), size)
 
-    def value(self, slot: Slot, datum: Datum, datum_type: Any) -> Any:
-        """Return the value of a datum that was set."""
+    def written(self, slot: Slot, aspect: Aspect[Any]) -> Any:
+        """Return the value that a slot was set to.
+
+        Raises:
+            NullDatumError: It was set to null.
+        """
+        datum, datum_type = self.data[slot], aspect.datum_type
+        if datum is None:
+            raise null_error(slot, None)
         shown = self.looked_at.get(slot)
         if shown is not None:
             return shown.value

@@ -6,39 +6,15 @@ the actors of `enact demo palletizing` decide with.  Nothing of it depends on th
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 from enact_dist.bench.rows import value_row
 from enact_dist.errors import MisuseError
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from enact_dist.bench.run import Run
+    from enact_dist.bench.run import Asked, Run
 
 NAME: Final = "palletizing"
-
-
-class Asked(NamedTuple):
-    """What is to be packed.
-
-    Attributes:
-        packages: How many.
-        seed: Of all that is random.
-        processes: How many trays are packed side by side.
-        spread: How far the belt's sensor is off (one sigma, mm) and friction; None: several.
-        perception: Whether perception alone is scored, on drawn packages without physics.
-        provoke: Errors that are provoked, see `actors.palletizing.simulation.knocks`.
-        out: Folder for what became of each tray, as it comes, and pictures of provoked errors.
-    """
-
-    packages: int = 36
-    seed: int = 1
-    processes: int = 2
-    spread: tuple[float, float] | None = None
-    perception: bool = False
-    provoke: tuple[str, ...] = ()
-    out: Path | None = None
 
 
 def run_palletizing(run: Run) -> None:

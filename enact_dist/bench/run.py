@@ -14,18 +14,41 @@ from __future__ import annotations
 import gc
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from enact_dist.bench.floors import Floors
-from enact_dist.bench.palletizing import Asked
 from enact_dist.bench.rows import FLOOR, Case, Key, Row, Sample, row_of, sample_of
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from enact_dist.bench.place import Place
 
 ROUNDS: Final = 3
 HERE: Final = frozenset((FLOOR, "core"))
 """What is measured of this machine, wherever the cell is."""
+
+
+class Asked(NamedTuple):
+    """What is to be packed.
+
+    Attributes:
+        packages: How many.
+        seed: Of all that is random.
+        processes: How many trays are packed side by side.
+        spread: How far the belt's sensor is off (one sigma, mm) and friction; None: several.
+        perception: Whether perception alone is scored, on drawn packages without physics.
+        provoke: Errors that are provoked, see `actors.palletizing.simulation.knocks`.
+        out: Folder for what became of each tray, as it comes, and pictures of provoked errors.
+    """
+
+    packages: int = 36
+    seed: int = 1
+    processes: int = 2
+    spread: tuple[float, float] | None = None
+    perception: bool = False
+    provoke: tuple[str, ...] = ()
+    out: Path | None = None
 
 
 def _place_of(key: Key) -> int:

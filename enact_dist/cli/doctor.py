@@ -31,7 +31,8 @@ def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
 
 def run_doctor(arguments: argparse.Namespace) -> int:
     """Print one line per check; status 1 if one of them failed."""
-    from enact_dist.operate.doctor import Level, examine
+    from enact_dist.operate.doctor import examine
+    from enact_dist.operate.doctor_cell import Level
 
     target = _target(arguments)
     findings = []

@@ -7,7 +7,7 @@ data arrive with the versions (up to 8 MiB per shard); large ones are fetched on
 from __future__ import annotations
 
 from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Protocol
 
 import numpy as np
 
@@ -21,7 +21,6 @@ from enact_dist.errors import MisuseError
 from enact_dist.link.client.fetch import fetch_all
 from enact_dist.terms import Access, Aspect
 from enact_dist.wire.limits import ITEMS_MAX
-from enact_dist.world.past import PastContext
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -45,6 +44,8 @@ Place = tuple[str, str]
 
 class Viewable(Protocol):
     """A `WorldContext`, or a `PastContext`."""
+
+    past: ClassVar[bool]
 
     @property
     def name(self) -> str:
@@ -163,14 +164,15 @@ def past_ns_of(world: Viewable) -> int:
     Raises:
         MisuseError: It shows data by when they were captured, which are of no one moment.
     """
-    if not isinstance(world, PastContext):
+    if not world.past:
         return 0
-    if not world.at_ns:
+    at_ns: int = getattr(world, "at_ns", 0)
+    if not at_ns:
         raise MisuseError(
             f"{world!r} shows data by their capture stamps, which are of no one moment of the world"
             " context; compare it as of a moment: at(position)"
         )
-    return world.at_ns
+    return at_ns
 
 
 def _is_fork(world: Viewable) -> bool:

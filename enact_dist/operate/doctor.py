@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import ctypes
-import enum
 import importlib
 import importlib.util
 import os
@@ -15,13 +14,13 @@ import shutil
 import socket
 import subprocess
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.state.clock import is_kept, state_of
 from enact_dist.errors import ConfigError, EnactError, ShardUnreachableError
 from enact_dist.link.memory.shared_folder import MEMORY, SHARED_FOLDER_VARIABLE
+from enact_dist.operate.doctor_cell import Finding, Level
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterator
@@ -51,31 +50,6 @@ SKEW_ROUNDS: Final = 5
 ROUND_TRIP_S_WARN: Final = 0.02
 
 SHM_BYTES_WARN: Final = 256_000_000
-
-
-class Level(enum.Enum):
-    """How grave a finding is."""
-
-    OK = "ok"
-    WARN = "warn"
-    FAIL = "FAIL"
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """The result of one check.
-
-    Attributes:
-        level: How grave it is.
-        subject: What was checked.
-        text: What was found.
-        remedy: What to do; empty where nothing has to be done.
-    """
-
-    level: Level
-    subject: str
-    text: str
-    remedy: str = ""
 
 
 def examine(target: str, *, timeout_s: float = 5.0) -> Iterator[Finding]:

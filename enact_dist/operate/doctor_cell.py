@@ -6,13 +6,14 @@ another file than the rest does not.
 
 from __future__ import annotations
 
+import enum
 import os
 import shutil
 import socket
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.state.clock import is_kept
-from enact_dist.operate.doctor import Finding, Level
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -32,6 +33,31 @@ _RESTART = (
     "take the file that the shards were started with; or stop them all, move entities with"
     " enact shard rebalance, and start all with this one"
 )
+
+
+class Level(enum.Enum):
+    """How grave a finding is."""
+
+    OK = "ok"
+    WARN = "warn"
+    FAIL = "FAIL"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """The result of one check.
+
+    Attributes:
+        level: How grave it is.
+        subject: What was checked.
+        text: What was found.
+        remedy: What to do; empty where nothing has to be done.
+    """
+
+    level: Level
+    subject: str
+    text: str
+    remedy: str = ""
 
 
 def differences(

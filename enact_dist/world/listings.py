@@ -15,7 +15,8 @@ from enact_dist.core.protocol.messages import (
     Surveyed,
     Welcome,
 )
-from enact_dist.core.state.retention import NO_LIMIT, limits_of
+from enact_dist.core.protocol.parts import NO_LIMIT
+from enact_dist.core.state.retention import limits_of
 from enact_dist.errors import LinkError, ProtocolError
 from enact_dist.link.refusals import error_of
 from enact_dist.terms import Entity, NullReason

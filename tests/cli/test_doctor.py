@@ -11,8 +11,7 @@ from enact_dist.config.read import load_config
 from enact_dist.core.protocol.messages import AspectEntry, Welcome
 from enact_dist.core.state.clock import unkept_epoch
 from enact_dist.operate import doctor
-from enact_dist.operate.doctor import Level
-from enact_dist.operate.doctor_cell import data_folder, differences
+from enact_dist.operate.doctor_cell import Level, data_folder, differences
 from enact_dist.world.listings import ShardInfo
 
 

@@ -17,10 +17,10 @@ from machine_messages import HOLDS, MS, TTLS, Pick, Plans
 from machine_pair import Pair
 from machine_staging import Staging
 
-from enact_dist.core.protocol.checks import wrong_decision
 from enact_dist.core.protocol.datum import LockId
 from enact_dist.core.protocol.messages import AwaitStamp, Finish, ListLocks, Survey
 from enact_dist.core.protocol.records import Called, Drain, SessionSeen, Tick
+from enact_dist.core.state.clock import wrong_decision
 
 STATES = (
     "unseen",

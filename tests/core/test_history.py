@@ -20,9 +20,10 @@ from enact_dist.core.protocol.messages import (
     Viewed,
     WriteItem,
 )
+from enact_dist.core.protocol.parts import NO_LIMIT
 from enact_dist.core.protocol.records import Content
 from enact_dist.core.state.history import Policy
-from enact_dist.core.state.retention import NO_LIMIT, Limits
+from enact_dist.core.state.retention import Limits
 from enact_dist.core.state.slots import SlotMap
 from enact_dist.terms import NullReason
 

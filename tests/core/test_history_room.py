@@ -4,9 +4,10 @@ import pytest
 from shard_bench import slot
 
 from enact_dist.core.protocol.datum import Datum
+from enact_dist.core.protocol.parts import NO_LIMIT
 from enact_dist.core.protocol.records import Content, SlotRecord
 from enact_dist.core.state.history import HELD_BYTES_MAX, Policy
-from enact_dist.core.state.retention import NO_LIMIT, Limits
+from enact_dist.core.state.retention import Limits
 from enact_dist.core.state.slots import SlotMap
 from enact_dist.terms import NullReason
 

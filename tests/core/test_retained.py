@@ -28,7 +28,7 @@ from enact_dist.core.protocol.messages import (
     Viewed,
     WriteItem,
 )
-from enact_dist.core.state.retention import NO_LIMIT
+from enact_dist.core.protocol.parts import NO_LIMIT
 from enact_dist.core.state.slots import INLINE_BYTES_MAX
 from enact_dist.terms import Access, NullReason
 

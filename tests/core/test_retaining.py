@@ -3,15 +3,8 @@
 import pytest
 
 from enact_dist.core.protocol.messages import AspectEntry
-from enact_dist.core.state.retention import (
-    DEFAULT,
-    NO_LIMIT,
-    Limits,
-    covers,
-    limits_of,
-    said,
-    with_larger,
-)
+from enact_dist.core.protocol.parts import NO_LIMIT
+from enact_dist.core.state.retention import DEFAULT, Limits, covers, limits_of, said, with_larger
 from enact_dist.terms import Aspect, Retention
 
 

@@ -14,10 +14,11 @@ from enact_dist.core.protocol.messages import (
     ListHistory,
     SlotVersion,
 )
+from enact_dist.core.protocol.parts import NO_LIMIT
 from enact_dist.core.protocol.records import Content, HistoryForgotten, Persist
 from enact_dist.core.state import history
 from enact_dist.core.state.history import Policy
-from enact_dist.core.state.retention import NO_LIMIT, Limits
+from enact_dist.core.state.retention import Limits
 from enact_dist.core.state.slots import SlotMap
 from enact_dist.terms import NullReason
 

@@ -10,18 +10,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.messages import Commit, Refused
-from enact_dist.core.protocol.parts import READS_MAX
-from enact_dist.core.state.clock import AHEAD_NS_MAX
-from enact_dist.core.state.retention import NO_LIMIT
+from enact_dist.core.protocol.parts import NO_LIMIT, READS_MAX
 from enact_dist.patterns import checked_patterns
 from enact_dist.terms import Access, Durability, checked_name
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
 
-    from enact_dist.core.protocol.datum import LockId, Position, Slot
+    from enact_dist.core.protocol.datum import Slot
     from enact_dist.core.protocol.messages import AspectEntry, Finish, Item, Prepare, WriteItem
-    from enact_dist.core.state.clock import Stamps
 
 WORLDS_TOLD_MAX: Final = 100
 """World contexts that a refusal names: a text has at most 64 KiB."""
@@ -165,32 +162,6 @@ def wrong_finish(message: Finish, primary: str) -> Refused | None:
     return _refused(
         f"shard {message.position.shard!r} is said to have committed {message.lock}, which was"
         f" prepared for shard {primary!r}"
-    )
-
-
-def wrong_decision(
-    lock: LockId, position: Position, stamps: Stamps, *, wall_ns: int
-) -> Refused | None:
-    """Refuse the stamp of a decision that no shard with a right clock gives.
-
-    It would permanently become the time of this shard, since timestamps only grow.  The decision
-    may be
-    said again: it is taken once the clocks agree.  Where this host's clock was set back, what was
-    promised lies ahead of it, and an honest decision a little later still.
-    """
-    if position.stamp_ns <= 0:
-        return _refused(
-            f"{lock} is said to be committed at stamp {position.stamp_ns}, which is none"
-        )
-    after_promise = position.stamp_ns <= stamps.last_ns + AHEAD_NS_MAX
-    if after_promise or not stamps.too_far_ahead(position.stamp_ns, wall_ns=wall_ns):
-        return None
-    ahead_s = (position.stamp_ns - wall_ns) / 1e9
-    return Refused(
-        "clock_skew",
-        f"shard {position.shard} has committed {lock} with a stamp {ahead_s:.1f} s ahead of the"
-        " clock of this shard; at most 1 s is accepted; set the clocks of both hosts, then the"
-        " commit is finished here, too",
     )
 
 

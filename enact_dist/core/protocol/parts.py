@@ -24,6 +24,9 @@ class Cursor(NamedTuple):
 START: Final = Cursor()
 """The begin of a listing; in an answer: its end."""
 
+NO_LIMIT: Final = 1 << 62
+"""Represents "no limit"; below the wire's largest integer, since messages may carry it."""
+
 
 class Item(NamedTuple):
     """One line of a lock or view: `access` is an `enact_dist.terms.Access` number.

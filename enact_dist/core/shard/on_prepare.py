@@ -24,7 +24,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final, cast
 
-from enact_dist.core.protocol.checks import wrong_decision, wrong_finish
+from enact_dist.core.protocol.checks import wrong_finish
 from enact_dist.core.protocol.datum import LockId, Position
 from enact_dist.core.protocol.messages import (
     RESOLVED_ABORTED,
@@ -58,6 +58,7 @@ from enact_dist.core.protocol.records import (
 from enact_dist.core.shard.forced_aborts import ForcedAborts
 from enact_dist.core.state.audit import FORCED
 from enact_dist.core.state.causes import cause_of, decided_cause
+from enact_dist.core.state.clock import wrong_decision
 from enact_dist.terms import Durability
 
 if TYPE_CHECKING:

@@ -10,7 +10,10 @@ from __future__ import annotations
 from bisect import bisect_left
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.core.protocol.messages import Refused
+
 if TYPE_CHECKING:
+    from enact_dist.core.protocol.datum import LockId, Position
     from enact_dist.core.protocol.records import Recovered
 
 BOUNDS_S: Final = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 10.0)
@@ -124,3 +127,29 @@ class Stamps:
         """Return the present; every later commit gets a larger stamp."""
         self.last_ns = max(self.last_ns, wall_ns)
         return self.last_ns
+
+
+def wrong_decision(
+    lock: LockId, position: Position, stamps: Stamps, *, wall_ns: int
+) -> Refused | None:
+    """Refuse the stamp of a decision that no shard with a right clock gives.
+
+    It would permanently become the time of this shard, since timestamps only grow.  The decision
+    may be said again: it is taken once the clocks agree.  Where this host's clock was set back,
+    what was promised lies ahead of it, and an honest decision a little later still.
+    """
+    if position.stamp_ns <= 0:
+        return Refused(
+            "protocol",
+            f"{lock} is said to be committed at stamp {position.stamp_ns}, which is none",
+        )
+    after_promise = position.stamp_ns <= stamps.last_ns + AHEAD_NS_MAX
+    if after_promise or not stamps.too_far_ahead(position.stamp_ns, wall_ns=wall_ns):
+        return None
+    ahead_s = (position.stamp_ns - wall_ns) / 1e9
+    return Refused(
+        "clock_skew",
+        f"shard {position.shard} has committed {lock} with a stamp {ahead_s:.1f} s ahead of the"
+        " clock of this shard; at most 1 s is accepted; set the clocks of both hosts, then the"
+        " commit is finished here, too",
+    )

@@ -18,10 +18,10 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from enact_dist.core.protocol.datum import Slot
-from enact_dist.core.protocol.parts import SlotVersion
+from enact_dist.core.protocol.parts import NO_LIMIT, SlotVersion
 from enact_dist.core.protocol.records import HistoryForgotten
 from enact_dist.core.state.causes import cause_bytes
-from enact_dist.core.state.retention import DEFAULT, NO_LIMIT, Limits, PayloadNames
+from enact_dist.core.state.retention import DEFAULT, Limits, PayloadNames
 from enact_dist.core.state.slot_history import KeptVersion, SlotHistory
 
 if TYPE_CHECKING:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from enact_dist.core.protocol.parts import NO_LIMIT
 from enact_dist.retention import DEFAULT_RETENTION
 
 if TYPE_CHECKING:
@@ -124,10 +125,6 @@ class AspectBases(Bases):
     def last(self) -> tuple[int, str]:
         """Return the latest stamp up to which nothing is known of an aspect (0: all is), and it."""
         return max(((at_ns, name) for name, at_ns in self._at_ns.items()), default=(0, ""))
-
-
-NO_LIMIT: Final = 1 << 62
-"""Represents "no limit"; below the wire's largest integer, since messages may carry it."""
 
 
 class Limits(NamedTuple):

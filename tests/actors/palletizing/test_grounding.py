@@ -9,12 +9,11 @@ import pytest
 from actors.geometry.kinematics import tool_poses
 from actors.geometry.reaching import reach
 from actors.palletizing import finger_room
+from actors.palletizing.finger_room import Grasp, Gripper
 from actors.palletizing.grounding import (
     BESIDE_M,
     FOLDER,
     SKELETONS,
-    Grasp,
-    Gripper,
     Job,
     aside_net,
     easier_turn,

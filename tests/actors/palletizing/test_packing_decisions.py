@@ -7,8 +7,8 @@ import pytest
 
 from actors.geometry.reaching import reach
 from actors.geometry.shapes import Surface
+from actors.palletizing.finger_room import Grasp
 from actors.palletizing.grasps import grasp_of, size_of
-from actors.palletizing.grounding import Grasp
 from actors.palletizing.handling import felt_on, fills, is_held
 from actors.palletizing.handling_data import GripCommand, GripState
 from actors.palletizing.reactions import (

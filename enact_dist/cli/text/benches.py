@@ -1,0 +1,75 @@
+"""The benches of `enact bench`: their names, and what its help says of each."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+
+class Told(NamedTuple):
+    """What `--help` says of a bench.
+
+    Attributes:
+        what: What it measures.
+        alone: Whether it can be `--embedded`: within one process.
+        guest: Whether it can `--connect` to a cell that runs.
+        minutes: Whether it takes more than a minute with the measuring time that is usual.
+        named: Whether it runs only where it is named: it needs an extra.
+    """
+
+    what: str
+    alone: bool = True
+    guest: bool = True
+    minutes: bool = False
+    named: bool = False
+
+
+BENCHES: Final = {
+    "floor": Told(
+        "the machine and the bare transports: Zenoh, Unix socket, memory, disk", minutes=True
+    ),
+    "core": Told("a shard's decisions alone: a lock and its commit, hand-over among 1,000"),
+    "update": Told("lock, read, write, release, by durability, over each carrier", minutes=True),
+    "layers": Told(
+        "where the time of an update, a fetch and a wake-up goes, layer by layer", minutes=True
+    ),
+    "multi": Told("up to 32 slots in a lock, 8 threads side by side, slots on several shards"),
+    "durable": Told("commits that survive a power cut: one, from several threads, of 10 MB"),
+    "waiters": Told("hand-over of a slot for which 2 to 32 threads wait", alone=False),
+    "fetch": Told("reading arrays of 1 kB to 100 MB, seen before, new, from afar", minutes=True),
+    "publish": Told("writing arrays of 1 kB to 100 MB, and committing what was filled in place"),
+    "wakeup": Told("from a commit in one process to its array in another", alone=False),
+    "history": Told(
+        "what kept versions cost an update; looks at the past, forks, 8 cameras whose history"
+        " fills memory (not with --connect)",
+        minutes=True,
+    ),
+    "pipeline": Told(
+        "17 processes: 8 cameras at 10 Hz, 8 workers, a reader of whole sets",
+        alone=False,
+        minutes=True,
+    ),
+    "stopped": Told("updates beside a reader of 50 MB that stands still", alone=False),
+    "memory": Told("a daemon's memory per slot and per commit", alone=False, guest=False),
+    "recovery": Told(
+        "how soon locks are back after a holder or a shard was killed",
+        alone=False,
+        guest=False,
+        minutes=True,
+    ),
+    "workcell": Told(
+        "eight cameras, hull, speed and path of `enact demo workcell`, scored on its truth;"
+        " --embedded plays twelve scenarios in simulated time, which no load changes, for its"
+        " quality alone",
+        guest=False,
+        minutes=True,
+        named=True,
+    ),
+    "palletizing": Told(
+        "robot, gripper and depth sensors pack --packages in simulated physics and time, scored on"
+        " what physics did: placements, verdicts by kind, recoveries, damage, cycle",
+        guest=False,
+        minutes=True,
+        named=True,
+    ),
+}
+"""The benches, in the order in which they run and stand in the table."""
