@@ -23,8 +23,8 @@ from enact_dist.bench.palletizing import run_palletizing
 from enact_dist.bench.payloads import run_fetch, run_publish, run_wakeup
 from enact_dist.bench.pipeline import run_pipeline
 from enact_dist.bench.place import EMBEDDED, Place
-from enact_dist.bench.rows import Row, shown_us
-from enact_dist.bench.run import Asked, Run
+from enact_dist.bench.rows import Row, shown_spread, shown_us
+from enact_dist.bench.run import Answer, Asked, Run
 from enact_dist.bench.tables import table
 from enact_dist.bench.updates import run_durable, run_multi, run_update, run_waiters
 from enact_dist.bench.visit import PEAK_BYTES, without_room
@@ -41,7 +41,10 @@ if TYPE_CHECKING:
 
 SECONDS_S: Final = 3.0
 """Measuring time of each line unless given."""
-COLUMNS: Final = ("bench", "variant", "median", "p99", "n", "x floor", "goal", "met", "note")
+COLUMNS: Final = (
+    "bench", "variant", "median", "rounds", "p99", "n", "x floor", "goal", "met", "note",
+)  # fmt: skip
+FIRST: Final = ("first of all", "here", "rounds", "raw floor of the same run", "", "x floor")
 
 
 def run_floor(run: Run) -> None:
@@ -161,11 +164,12 @@ def run(arguments: argparse.Namespace) -> int:
             place, floors, seconds_s=seconds_s, told=told, seeds=arguments.seeds, packing=packing
         )
         failed = [name for name in names if not _ran(name, measured)]
-        rows = measured.rows()
+        rows, first = measured.rows(), measured.answer()
     if arguments.json:
-        print_json({"machine": found, "rows": [row.as_json() for row in rows]})
+        answer = [one.as_json() for one in first]
+        print_json({"machine": found, "answer": answer, "rows": [row.as_json() for row in rows]})
     else:
-        _print(found, rows)
+        _print(found, first, rows)
     return FAILED if failed else DONE
 
 
@@ -268,14 +272,26 @@ def _cells(row: Row) -> tuple[str, ...]:
     ratio = "" if row.ratio is None else f"{row.ratio:.2f}"
     speed = "" if row.mb_s is None else f"{row.mb_s:,.0f} MB/s"
     note = "; ".join(filter(None, (speed, row.beside, row.note)))
-    return row.name, row.variant, median, p99, f"{row.n:,}", ratio, row.goal or "", met, note
+    rounds = "" if row.spread_us is None else shown_spread(row.spread_us)
+    goal, count = row.goal or "", f"{row.n:,}"
+    return row.name, row.variant, median, rounds, p99, count, ratio, goal, met, note
 
 
-def _print(found: Mapping[str, object], rows: Sequence[Row]) -> None:
+def _first(one: Answer) -> tuple[str, ...]:
+    """Return the line of a figure that comes first: its name, its cells, its floor."""
+    _, _, median, rounds, _, _, ratio, *_ = _cells(one.row)
+    floor = "" if one.floor_us is None else shown_us(one.floor_us)
+    return one.what, median, rounds, one.floor, floor, ratio
+
+
+def _print(found: Mapping[str, object], first: Sequence[Answer], rows: Sequence[Row]) -> None:
     print(
         f"{found['processor']}, {found['cores']} cores, Python {found['python']}, load before"
         f" {found['load']}"
     )
+    if first:
+        print_table(FIRST, [_first(one) for one in first], empty="")
+        print()
     print_table(COLUMNS, [_cells(row) for row in rows], empty="nothing was measured")
     judged = [row for row in rows if row.goal is not None]
     missed = [row for row in judged if row.met is False]

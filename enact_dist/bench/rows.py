@@ -21,11 +21,13 @@ class Sample:
         median_us: Half of them took no longer, microseconds.
         p99_us: 99 of 100 took no longer, microseconds.
         n: How many there are.
+        rounds_us: The median of each round in which they were measured, microseconds.
     """
 
     median_us: float
     p99_us: float
     n: int
+    rounds_us: tuple[float, ...] = ()
 
 
 Figures: TypeAlias = Mapping[Key, Sample]
@@ -139,6 +141,7 @@ class Row:
         note: What a reader should know beside it.
         mb_s: Megabytes (10^6 bytes) per second of the median, where the speed is of interest.
         beside: So many times another row that its goal does not name, in words.
+        spread_us: The lowest and the highest median of a round, microseconds.
     """
 
     name: str
@@ -154,6 +157,7 @@ class Row:
     note: str = ""
     mb_s: float | None = None
     beside: str = ""
+    spread_us: tuple[float, float] | None = None
 
     def as_json(self) -> dict[str, object]:
         """Return the row as it stands in JSON; what only some rows have, only where it is."""
@@ -162,6 +166,8 @@ class Row:
             found |= {"value": self.value, "unit": self.unit}
         if self.mb_s is not None:
             found["mb_s"] = self.mb_s
+        if self.spread_us is not None:
+            found["spread_us"] = self.spread_us
         found |= {name: text for name in TEXT_FIELDS if (text := getattr(self, name))}
         return found
 
@@ -200,7 +206,13 @@ def row_of(case: Case, figures: Figures) -> Row:
         case.goal.met(sample, figures) if case.goal is not None else None,
         mb_s=round(case.bytes / sample.median_us, 1) if case.bytes else None,
         beside=_beside(case, sample, figures),
+        spread_us=_spread_us(sample),
     )
+
+
+def _spread_us(sample: Sample) -> tuple[float, float] | None:
+    rounds_us = sample.rounds_us
+    return (round(min(rounds_us), 2), round(max(rounds_us), 2)) if len(rounds_us) > 1 else None
 
 
 def _beside(case: Case, sample: Sample, figures: Figures) -> str:
@@ -208,6 +220,12 @@ def _beside(case: Case, sample: Sample, figures: Figures) -> str:
         return ""
     key, name = case.beside
     return f"{sample.median_us / figures[key].median_us:.2f} x {name}"
+
+
+def shown_spread(spread_us: Sequence[float]) -> str:
+    """Return the lowest and the highest median of a round."""
+    lowest_us, highest_us = spread_us
+    return f"{shown_us(lowest_us)} to {shown_us(highest_us)}"
 
 
 def shown_us(value_us: float) -> str:

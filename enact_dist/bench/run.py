@@ -1,9 +1,9 @@
 """One run of benches: measures cases in rounds, and makes the rows.
 
 Two cores of a shared machine swing by a factor of two within seconds.  So all cases of a bench are
-measured in turn, several times over, and of each the lowest median of a round counts: a figure and
-its floor come from the machine's good moments alike.  The 99th percentile is that of all rounds
-together, for a tail that only the best round lacks is a tail.
+measured in turn, several times over: a figure and its floor meet the same moments of the machine.
+Median and 99th percentile are those of all rounds together, and the spread is that of the medians
+of all rounds: a figure of the best round alone would hide what a user sees.
 
 A cell on another host has another disk and other ways than this machine, whose floors say nothing
 of it then: no ratio is given and no goal judged, but for what runs in this process alone.
@@ -17,6 +17,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from enact_dist.bench.floors import Floors
+from enact_dist.bench.place import EMBEDDED
 from enact_dist.bench.rows import FLOOR, Case, Key, Row, Sample, row_of, sample_of
 
 if TYPE_CHECKING:
@@ -25,6 +26,17 @@ if TYPE_CHECKING:
     from enact_dist.bench.place import Place
 
 ROUNDS: Final = 3
+_PLAIN: Final = tuple(
+    ("update", f"{way}, volatile") for way in ("socket", "auto", "zenoh", EMBEDDED)
+)
+ANSWER: Final[dict[str, tuple[Key, ...]]] = {
+    "update": _PLAIN,
+    "repeat read": (("fetch", "0.9 MB, seen before"),),
+    "4 slots": tuple((name, f"{variant}, 4 slots") for name, variant in _PLAIN),
+    "wake-up": (("wakeup", "64 B"),),
+    "pipeline": (("pipeline", "image stored to 8 masks read"),),
+}
+"""The five figures that come first, each the first of these rows that was measured."""
 HERE: Final = frozenset((FLOOR, "core"))
 """What is measured of this machine, wherever the cell is."""
 
@@ -49,6 +61,36 @@ class Asked(NamedTuple):
     perception: bool = False
     provoke: tuple[str, ...] = ()
     out: Path | None = None
+
+
+class Answer(NamedTuple):
+    """One of the five figures that come first.
+
+    Attributes:
+        what: Its name there.
+        row: The row of the table that it repeats.
+        floor: The raw floor beside it; empty if the cell is on another host.
+        floor_us: Median of that floor in the same run, microseconds; None if there is none.
+    """
+
+    what: str
+    row: Row
+    floor: str
+    floor_us: float | None
+
+    def as_json(self) -> dict[str, object]:
+        """Return the figure as it stands in JSON."""
+        row = self.row
+        return {
+            "what": self.what,
+            "name": row.name,
+            "variant": row.variant,
+            "median_us": row.median_us,
+            "spread_us": row.spread_us,
+            "floor": self.floor,
+            "floor_us": self.floor_us,
+            "ratio": row.ratio,
+        }
 
 
 def _place_of(key: Key) -> int:
@@ -104,13 +146,12 @@ class Run:
         return case.measure(seconds_s)
 
     def _keep(self, case: Case, times_us: Sequence[float]) -> None:
-        median_us = sample_of(times_us).median_us
         self._cases.setdefault(case.key, case)
-        if case.key in self._figures:
-            median_us = min(median_us, self._figures[case.key].median_us)
+        before = self._figures.get(case.key)
+        rounds_us = (*(before.rounds_us if before else ()), sample_of(times_us).median_us)
         every_us = self._times_us.setdefault(case.key, [])
         every_us += times_us
-        self._figures[case.key] = replace(sample_of(every_us), median_us=median_us)
+        self._figures[case.key] = replace(sample_of(every_us), rounds_us=rounds_us)
 
     def add(self, case: Case, times_us: Sequence[float]) -> None:
         """Add a case that was measured elsewhere."""
@@ -131,3 +172,15 @@ class Run:
         names.sort(key=lambda name: name != FLOOR)
         ordered = sorted(found, key=lambda row: _place_of((row.name, row.variant)))
         return [row for name in names for row in (*ordered, *self._others) if row.name == name]
+
+    def answer(self) -> list[Answer]:
+        """Return those of the five figures of `ANSWER` that were measured."""
+        rows = {(row.name, row.variant): row for row in self.rows()}
+        found = []
+        for what, keys in ANSWER.items():
+            key = next((one for one in keys if one in self._figures), None)
+            if key is not None:
+                floor = self._cases[key].floor if rows[key].ratio is not None else None
+                floor_us = round(self._figures[floor].median_us, 2) if floor is not None else None
+                found.append(Answer(what, rows[key], floor[1] if floor else "", floor_us))
+        return found

@@ -11,7 +11,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
-from enact_dist.bench.rows import FLOOR, shown_us
+from enact_dist.bench.rows import FLOOR, shown_spread, shown_us
 from enact_dist.errors import MisuseError
 
 if TYPE_CHECKING:
@@ -107,7 +107,8 @@ def _cell(row: Mapping[str, Any] | None) -> str:
         return f"{row['value']:g} {row.get('unit') or ''}".strip() + f" (n {row['n']:,})"
     if row["median_us"] is None:
         return ""
-    said = [f"p99 {shown_us(row['p99_us'])}", f"n {row['n']:,}"]
+    said = [f"rounds {shown_spread(row['spread_us'])}"] if row.get("spread_us") else []
+    said += [f"p99 {shown_us(row['p99_us'])}", f"n {row['n']:,}"]
     if row["ratio"] is not None:
         said.append(f"{row['ratio']:.2f} x")
     if row.get("beside"):

@@ -15,6 +15,8 @@ import pytest
 from enact_dist import Aspect, Entity, Lock, View, connect
 from enact_dist.bench import command, history, updates
 from enact_dist.bench.place import Place
+from enact_dist.bench.rows import Row
+from enact_dist.bench.run import Answer
 from enact_dist.bench.visit import PEAK_BYTES, Visit, without_room
 from enact_dist.cli import bench
 from enact_dist.errors import EnactError, LinkError, ShardUnreachableError
@@ -26,10 +28,10 @@ SHORT = ("--seconds", "0.03")
 
 def rows_of(result):
     assert result.status == 0, result.err
-    assert set(result.json) == {"machine", "rows"}
+    assert set(result.json) == {"machine", "answer", "rows"}
     for row in result.json["rows"]:
         assert list(row)[: len(FIELDS)] == FIELDS
-        assert set(row) - set(FIELDS) - {"mb_s"} in (
+        assert set(row) - set(FIELDS) - {"mb_s", "spread_us"} in (
             set(),
             {"value", "unit"},
             {"note"},
@@ -57,6 +59,12 @@ def test_updates_in_the_process_are_told_as_json(enact):
     assert judged["goal"] == "≤ 120 µs"
     assert judged["met"] is (judged["median_us"] <= 120.0)
     assert result.json["machine"]["cores"] > 0
+    assert [one["what"] for one in result.json["answer"]] == ["update", "4 slots"]
+    (first, _), row = result.json["answer"], rows["update", "embedded, volatile"]
+    assert {name: first[name] for name in ("median_us", "spread_us", "ratio")} == {
+        name: row[name] for name in ("median_us", "spread_us", "ratio")
+    }
+    assert (first["floor"], first["floor_us"]) == ("zenoh query", floor["median_us"])
 
 
 def test_core_is_a_table_for_people(enact):
@@ -72,6 +80,35 @@ def test_core_is_a_table_for_people(enact):
     assert line.split()[-1] in {"yes", "NO"}
     (line,) = (line for line in lines if "goals," in line)
     assert line.startswith("2 goals, ")
+
+
+def test_five_figures_stand_before_the_table(capsys):
+    """A line each: here, its rounds, the raw floor of the same run, the ratio."""
+    row = Row("wakeup", "64 B", 540.0, 900.0, 600, 20.0, spread_us=(500.0, 610.0))
+
+    machine = {"processor": "P", "cores": 2, "python": "3.11", "load": 0.1}
+    command._print(machine, [Answer("wake-up", row, "socket echo", 27.0)], [row])
+
+    _, names, first, empty, head, *_ = capsys.readouterr().out.splitlines()
+    assert names.split("  ")[0] == "first of all"
+    words = [
+        "wake-up",
+        "540",
+        "µs",
+        "500",
+        "µs",
+        "to",
+        "610",
+        "µs",
+        "socket",
+        "echo",
+        "27.0",
+        "µs",
+        "20.00",
+    ]
+    assert first.split() == words
+    assert not empty
+    assert head.split()[:4] == ["bench", "variant", "median", "rounds"]
 
 
 @pytest.mark.slow
