@@ -77,7 +77,7 @@ def alone(name: str) -> Iterator[None]:
 
 
 def run(*words: str, cwd: Path | None = None) -> None:
-    """Run a command that says nothing when it works; leave with its words when it does not."""
+    """Run a command that prints nothing when it works; leave with its words when it does not."""
     try:
         done = subprocess.run(words, cwd=cwd, capture_output=True, text=True, check=False)
     except FileNotFoundError:

@@ -4,7 +4,7 @@ what is new -> register the trained surface -> render it into the sensor -> comp
 (median 5, mean 7x7, limit from the sensor's spread, a band along edges left out) -> largest blob
 what an upright package does not explain -> the same surface with six freedoms: does it lean?
 
-Packages in contact are told apart by the image before, in which the neighbours stand already.
+Packages in contact are distinguished by the image before, in which the neighbours stand already.
 
 Rules a change must keep: depth is the only evidence; limits carry the numbers they come from;
 what an overhead sensor cannot see (a dent below `Limits`, or in a face seen flat) is not claimed.

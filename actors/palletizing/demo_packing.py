@@ -6,7 +6,7 @@ and the actors are processes of their own.  This process only looks.  Files in `
 =======================  ===========================================================================
 model_<product>.png      the trained surface, each planar patch in its colour
 tray_<n>.png             each tray with the deviating regions in red
-cell.png                 the cell in the midst of the run, drawn by MuJoCo;
+cell.png                 the cell in the middle of the run, drawn by MuJoCo;
                          deviation_<place>.png: when one was found
 net_<stage>.svg          each net, with the trace of one run
 actors.svg               who reads and writes what, drawn from the declarations

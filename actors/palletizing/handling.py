@@ -103,8 +103,8 @@ def is_held(grip: GripCommand | None, gripper: GripState | None, grasp: Grasp | 
 
     Args:
         grip: The last command to the gripper; None: there was none.
-        gripper: What the gripper measures; None if it is not known: a hand that was told to press
-            is not empty then.
+        gripper: What the gripper measures; None if it is not known: a hand that was ordered to
+            press is not empty then.
         grasp: Of the product; None if nothing can be known to hold it.
     """
     if grip is None or grasp is None:

@@ -51,7 +51,7 @@ QUANTITIES: Final = {
 """What a condition may ask for, with its unit; see `Condition`."""
 RELATIONS: Final = (">", "<")
 TOOLS: Final = {"keep": "", "width": "m", "force": "N"}
-"""What the gripper may be told, with the unit of the value."""
+"""Commands to the gripper, with the unit of the value."""
 SPEED_M_S_MAX: Final = 1.5
 FORCE_N_MAX: Final = 100.0
 WIDTH_M_MAX: Final = 0.2

@@ -20,7 +20,7 @@ class Judgement:
     Attributes:
         place: Number of the place.
         verdict: What was seen: "ok", "missing", "moved", "tipped", "deformed", "extra".
-        truth: What was so, in the same words.
+        truth: What was so, with the same values.
         shift_mm: Of the true pose against the plan.
         turn_deg: The same turn.
         pose_error_mm: Of the found against the true position; NaN if nothing was found.

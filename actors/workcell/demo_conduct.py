@@ -79,7 +79,7 @@ class Notes:
         nearest_m: Nearest estimated distance.
         nearest_ns: Exposure of it.
         forked_ns: When the fork was made; 0: it was not.
-        lines: What was told, with the second.
+        lines: What was printed, with the second.
         faults: What was done to which process.
         cores: Processor time per second of each process.
     """
@@ -250,7 +250,7 @@ class Conductor:
         return state
 
     def _look_for_foreign(self, now_s: float) -> None:
-        """Report each object that somebody has left, once."""
+        """Report each object that was left behind, once."""
         request = ViewEach(self._online, words.HUMANS, words.TRACK)
         for name, track in self._online.view(request)[request].items():
             if track.foreign and name not in self._foreign:

@@ -187,8 +187,8 @@ def scores_of(runs: Sequence[Samples]) -> dict[str, float]:
     Productivity is the mean share of the nominal speed while the arm is not at a goal, beside that
     of two other robots in the same scenario, with the same arm, task, planner, reaction time and
     formula: one goes by the true distance and the true bodies (the oracle), one runs at full speed
-    while nobody is nearer to any place of its task than the protective distance of the full speed,
-    and rests else (the fixed zone).
+    while no person is nearer to any place of its task than the protective distance of the full
+    speed, and rests else (the fixed zone).
 
     Args:
         runs: Of `samples_of`, at least one.

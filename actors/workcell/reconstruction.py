@@ -146,7 +146,7 @@ class Reconstruction(Actor):
         if not within_s < PERIOD_S / 2:
             raise ValueError(
                 f"within_s is {within_s:g}; with half the period, {PERIOD_S / 2:g} s, or more it"
-                " cannot be told which image belongs to which set"
+                " cannot be known which image belongs to which set"
             )
         every = _sets(cameras, within_s, least)
         if every == cls.silhouettes:

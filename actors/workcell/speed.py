@@ -117,7 +117,7 @@ def judged(
     if limit_m_s < nominal_m_s:
         text = f"{nearest_m:.2f} m to the robot allow {limit_m_s:.2f} m/s"
         return Verdict("slow", limit_m_s, "someone is near", text)
-    near = "nobody is there" if math.isinf(nearest_m) else f"{nearest_m:.2f} m to the robot"
+    near = "no person is there" if math.isinf(nearest_m) else f"{nearest_m:.2f} m to the robot"
     return Verdict("run", limit_m_s, "", near)
 
 

@@ -105,7 +105,7 @@ class TrueHull:
         return _hull(index, clearance, component, nearest)
 
     def zone_at(self, at_s: float, radius_m: float) -> Hull:
-        """Return an empty hull: infinitely far, or at distance 0 while somebody is in the zone.
+        """Return an empty hull: infinitely far, or at distance 0 while a person is in the zone.
 
         Args:
             at_s: Time of the scenario.

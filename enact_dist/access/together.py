@@ -58,8 +58,8 @@ class Together(Generic[T_co]):
         requests: Two or more `View`s of single entities; their order is that of the data.
         by: "stamp": the data of a set share their capture timestamp.
         within_s: How far the stamps of one set may lie apart, seconds; less than half the period at
-            which they come, else it cannot be told what belongs to which set.  The stamp of a set
-            is the oldest of its data.
+            which they come, else sets cannot be distinguished.  The stamp of a set is the oldest of
+            its data.
         least: The least number of data with which a set runs: as soon as it is certain that the
             others do not come, or `least_after_s` after the first of them has arrived.  The missing
             ones are None in ``lock[together]``, null for the `View` of each, and named by

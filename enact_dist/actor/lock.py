@@ -36,7 +36,7 @@ class ActorLock(Lock):
     """A lock that translates the requests of an actor class into its own.
 
     Only requests that name a role are translated: by name alone a role `online` that is bound to
-    the context `training` could not be told from the context `online`.
+    the context `training` could not be distinguished from the context `online`.
 
     Args:
         bound: Each declared request with its bound form in this update.

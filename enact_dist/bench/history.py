@@ -43,7 +43,7 @@ KEPT: Final[dict[str, int | None]] = {
     "with history": None,
     f"with {MANY:,} versions": MANY,
 }
-"""How many versions stay; None: what holds where nobody says anything."""
+"""How many versions stay; None: the default."""
 ITS_COST: Final = "≤ 1.1 x without"
 FORKED: Final = 100
 """Slots of a context that is forked."""

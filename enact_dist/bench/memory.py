@@ -1,6 +1,6 @@
 """Bench `memory`: what one slot costs a shard beside its payload, and one commit for good.
 
-Its daemon has served nothing before: of memory that was freed nobody can tell whether it is used.
+Its daemon has served nothing before: a process does not show which freed memory it uses.
 """
 
 from __future__ import annotations

@@ -3,10 +3,10 @@
 A fetch is divided by mapping a file of that size from shared memory (over the network: by a raw
 Zenoh answer of that size), a publication by writing such a file.
 
-Whoever has just written 100 MB has driven everything else out of the processor's caches, and what
+A process that has just written 100 MB has emptied the processor's caches of all else, and what
 comes next is slow, whatever its size.  So where 100 MB are compared with 1 kB right after they were
-written, the 1 kB come after 100 MB that somebody wrote elsewhere; how they compare with 1 kB alone
-stands beside it.
+written, the 1 kB come after 100 MB that another process wrote elsewhere; how they compare with 1 kB
+alone stands beside it.
 """
 
 from __future__ import annotations

@@ -93,7 +93,7 @@ class Place:
         self._daemons: list[LineProcess] = []
         self._visit = Visit(target, connected=self._anew, said=said) if target else None
         if self.own and shared is not None:
-            # Nobody else's files there: what it grows by is ours.
+            # No other files are there: what it grows by is ours.
             shared.mkdir(mode=0o700)
             self._stack.enter_context(environment(**{SHARED_FOLDER_VARIABLE: str(shared)}))
 
@@ -142,7 +142,7 @@ class Place:
         for name in self.shard_names:
             lines += ["[[pins]]", f'entities = "{name}/**"', f'shard = "{name}"']
         file.write_text("\n".join(lines) + "\n")
-        # They end with us, however we end: nobody else would ever stop them.
+        # They end with us, however we end: nothing else would ever stop them.
         with environment(**{CARRIER_VARIABLE: "auto", SUPERVISOR_VARIABLE: str(os.getpid())}):
             self._daemons = [
                 self._process(COMMAND, ("shard", "run", name, "--cell", str(file)))

@@ -55,7 +55,7 @@ class Goal:
         limit_us: The longest median, from the other figures of the same run; None where those
             were not measured.
         p99_us: The longest 99th percentile; None where none is set.
-        needs: The figures that `limit_us` is told from.
+        needs: The figures that `limit_us` depends on.
     """
 
     text: str
@@ -64,7 +64,7 @@ class Goal:
     needs: tuple[Key, ...] = ()
 
     def met(self, sample: Sample, figures: Figures) -> bool | None:
-        """Say whether `sample` keeps to it; None where that cannot be told from this run."""
+        """Say whether `sample` keeps to it; None where this run does not show it."""
         limit_us = self.limit_us(figures)
         if limit_us is None:
             return None

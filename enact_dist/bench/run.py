@@ -130,7 +130,7 @@ class Run:
         self._others: list[Row] = []
 
     def measure(self, cases: Sequence[Case], *, rounds: int = ROUNDS) -> None:
-        """Measure all cases in turn, with the floors that they and their goals are told by."""
+        """Measure all cases in turn, with the floors that they and their goals depend on."""
         floors = {key for case in cases for key in case.needs if key[0] == FLOOR}
         every = [self.floors.case(floor[1]) for floor in sorted(floors)] + list(cases)
         for number in range(rounds):

@@ -288,7 +288,7 @@ def _per_act_us(counts: list[int], seconds_s: float, failed: list[BaseException]
 
 
 def run_waiters(run: Run) -> None:
-    """Hand-over of one slot: how long nobody holds it while several threads wait for it.
+    """Hand-over of one slot: how long no thread holds it while several wait for it.
 
     The budgets speak of the core's hand-over alone, which the bench `core` measures.
     """
@@ -303,7 +303,7 @@ def run_waiters(run: Run) -> None:
 def _hand_over(run: Run, count: int) -> Callable[[float], list[float]]:
     def measure(seconds_s: float) -> list[float]:
         while not (found_us := held_for(seconds_s)):
-            seconds_s = max(2.0 * seconds_s, 0.1)  # a busy machine: nobody had his turn
+            seconds_s = max(2.0 * seconds_s, 0.1)  # a busy machine: no thread had its turn
         return found_us
 
     def held_for(seconds_s: float) -> list[float]:

@@ -18,7 +18,7 @@ WARM_UP_S: Final = 10.0
 """Samples of the first so many seconds say nothing about growth."""
 SAMPLES: Final = 60
 SAMPLES_MIN: Final = 5
-"""From fewer samples after the warm-up, or in a shorter time than it, no growth is told."""
+"""From fewer samples after the warm-up, or in a shorter time than it, no growth is reported."""
 KINDS_OF_MEMORY: Final = {"RssAnon:": "private", "RssShmem:": "shared"}
 
 

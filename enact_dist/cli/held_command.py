@@ -100,7 +100,7 @@ class HeldCommand:
         self._to_foreground(os.getpgrp())
 
     def _signal(self, number: signal.Signals) -> None:
-        with contextlib.suppress(ProcessLookupError, PermissionError):  # nobody is left in it
+        with contextlib.suppress(ProcessLookupError, PermissionError):  # it has ended
             os.killpg(self._process.pid, number)
 
     def _to_foreground(self, group: int) -> None:

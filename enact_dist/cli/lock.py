@@ -99,7 +99,7 @@ def _add_break(verbs: argparse._SubParsersAction[Verb]) -> None:
     cut = add_verb(
         verbs,
         "break",
-        "take a lock away from its holder, who is told why; its commit will be refused",
+        "take a lock away from its holder, who learns why; its commit will be refused",
         run=break_lock,
         example="enact lock break 1742 --shard left --reason 'camera unplugged'",
     )
@@ -253,7 +253,7 @@ def _hold(cell: Cell, arguments: argparse.Namespace, stop: StopSignals) -> int:
             while not running.wait(POLL_S):
                 running.pass_on(stop)
                 if not client.valid(lock):
-                    # It may be lost: the command must not go on while nobody knows.
+                    # It may be lost: the command must not go on while that is unknown.
                     running.pause()
                     client.check(lock)
                     running.resume()
@@ -266,7 +266,7 @@ def _hold(cell: Cell, arguments: argparse.Namespace, stop: StopSignals) -> int:
         doubt = "whether it held the lock to its end" if by_itself else "whether it holds the lock"
         fate = "had ended by itself, but" if by_itself else "was ended, as"
         raise ShardUnreachableError(
-            f"{error}; {name} {fate} nobody can say {doubt}",
+            f"{error}; {name} {fate} it is unknown {doubt}",
             shard=error.shard,
             endpoint=error.endpoint,
         ) from error

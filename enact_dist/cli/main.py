@@ -158,7 +158,7 @@ def _run(arguments: argparse.Namespace) -> int:
     except EnactError as error:
         return _report(error, arguments)
     except BrokenPipeError:
-        # Whoever read our output has seen enough; what is left must not fail again at exit.
+        # The reader of our output has seen enough; what is left must not fail again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     except (OSError, ImportError, MemoryError) as error:

@@ -132,7 +132,7 @@ class DiskThread:
                     self._file.add_gap(entry.log_ns, entry.gap)
                 elif entry.versions:
                     self._file.add_commit(entry.versions, entry.log_ns)
-        except Exception as error:  # noqa: BLE001 - whoever records is told, and ends
+        except Exception as error:  # noqa: BLE001 - the recorder learns of it, and ends
             self._file.abandon()
             with self._changed:
                 self._error = error

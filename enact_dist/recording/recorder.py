@@ -245,7 +245,7 @@ class Recorder:
             "missing": str(summary.missing),
         }
 
-    # ---------------------------------------------------------------- what is told
+    # ---------------------------------------------------------------- the summary
 
     def _begin(self, watch: Watch) -> None:
         """Take what is there; of each slot the newest version is what the recording begins with."""
@@ -470,8 +470,8 @@ def _commits(
 ) -> Iterator[list[Wanted]]:
     """Yield the versions of one commit after another.
 
-    The data of a commit bear one stamp on all shards.  Two commits that bear the same one are told
-    apart by their locks; where one of these is not known they count as one.
+    The data of a commit bear one stamp on all shards.  The locks distinguish two commits that bear
+    the same one; where one of these is not known they count as one.
     """
     for _, same in itertools.groupby(batch, _stamp):
         group = list(same)

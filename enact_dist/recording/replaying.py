@@ -336,8 +336,8 @@ class Replay:
             if type_conflict(AspectEntry(name, *types[name]), wanted):
                 raise DatumTypeError(
                     f"aspect {name!r} is {facts.fingerprint} in {self.recording.path} and"
-                    f" {types[name][0]} in cell {self._cell.name!r}: nobody there could read what"
-                    " a replay sets"
+                    f" {types[name][0]} in cell {self._cell.name!r}: no program there could read"
+                    " what a replay sets"
                 )
         return names
 

@@ -1,9 +1,9 @@
-"""When commits that were told of may be recorded: all of them is shown, and all of it was told.
+"""When announced commits may be recorded: once shards show all of them, and all were announced.
 
 A commit over shards stands when one of them has decided; each other one shows its part when its
-own disk has kept that, and tells of it then.  So the shards are asked whether they show everything
-up to the newest stamp that was told, and what is told until a rest after that is recorded.  While a
-recording goes on it does not wait for a shard that does not answer, or that is slower than
+own disk has kept that, and announces it then.  So the recorder asks the shards whether they show
+everything up to the newest announced stamp, and records what is announced until a rest after that.
+While a recording goes on it does not wait for a shard that does not answer, or that is slower than
 `SHOWN_S`: what has to be fetched is remembered for 2 s only.  At its begin and end it asks such a
 shard again until the time is over, since a busy host may delay one answer.
 """
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 SHOWN_S: Final = 1.0
 """How long a commit waits for shards that do not show it yet."""
 END_S: Final = 5.0
-"""The same at the end of a recording, after which there is nobody to see the rest of it."""
+"""The same at the end of a recording, after which nothing records the rest of it."""
 ASK_S: Final = 0.05
 """The pause between two questions, and how long a shard may take its time with the answer."""
 ANSWER_S: Final = 0.25

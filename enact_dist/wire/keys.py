@@ -130,7 +130,7 @@ def parse_request_key(key: str) -> RequestKey:
         )
     if "*" in chunks[3] or quoted_identity(chunks[4]) != chunks[4]:
         raise ProtocolError(
-            f"the key {key[:200]!r} names no single verb and identity, so nobody is answered there"
+            f"the key {key[:200]!r} names no single verb and identity, so it gets no answer"
         )
     return RequestKey(*chunks[1:])
 

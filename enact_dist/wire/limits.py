@@ -16,8 +16,8 @@ FRAME_VERSION: Final = 7
 names shared memory; 5: a datum may name a payload in place of its bytes; 7: an identity stands in
 the key of each request and token, and where a socket is opened; an aspect names the types that its
 own has succeeded; listings come in pages; whether a shard is there is asked by a ping, whose answer
-names the start of its daemon; whoever
-waits for a stamp names its session."""
+names the start of its daemon; a
+request that waits for a stamp names its session."""
 DATUM_VERSION: Final = 1
 """Version of the encoding of data; these are stored, so old versions stay readable."""
 

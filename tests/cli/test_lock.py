@@ -115,7 +115,7 @@ def test_hold_says_that_it_ended_its_command_when_the_shard_went(write_cell, spa
 
     assert hold.wait(60) == 3
     assert "shard left" in rest
-    assert "sh was ended, as nobody can say whether it holds the lock" in rest
+    assert "sh was ended, as it is unknown whether it holds the lock" in rest
     assert "survived" not in rest
 
 

@@ -89,7 +89,7 @@ def test_unknown_aspects_and_running_shards_are_refused(enact, stopped):
 
 
 def test_shards_elsewhere_are_named_with_what_to_do_there(enact, stopped):
-    """What is here goes; of a shard without data here nobody can say whether it has some."""
+    """What is here goes; of a shard without data here it is unknown whether it has some."""
     text = stopped.read_text()
     stopped.write_text(
         text.replace("[shards.right]", '[shards.right]\nhost = "far"')

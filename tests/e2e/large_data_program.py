@@ -1,6 +1,6 @@
 """One program on large data: `large_data_program.py CELL_FILE [pause]`; prints what it found.
 
-With `pause` it says how far it is in the midst of each transfer and goes on when told, so that the
+With `pause` it says how far it is in the middle of each transfer and goes on when told, so that the
 test can do something to the network.
 """
 

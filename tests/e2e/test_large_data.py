@@ -72,7 +72,7 @@ def test_program_far_from_its_shards_finds_what_one_beside_them_finds(run):
 
 
 def test_program_that_is_cut_off_in_mid_transfer_goes_on_when_the_network_is_back(run, hosts):
-    """Links end in the midst of a publication and of a fetch; the lock lives, nothing is lost."""
+    """Links end in the middle of a publication and of a fetch; the lock lives, nothing is lost."""
     calm, _ = told(run("far"))
     program = run("far", "pause")
     for kind in ("Stage", "Fetch"):

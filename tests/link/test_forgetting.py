@@ -143,7 +143,7 @@ def test_what_came_since_stays_where_only_marks_were_left(tmp_path):
     with local(cell.folders["left"]) as left:
         entity = next(e for e in ENTITIES if shard_of(e.name, TWO) == "left")
         version = put({"left": left}, entity, NEW_POSE, "new")
-    with pytest.raises(StoreError, match="midst of forgetting pose"):
+    with pytest.raises(StoreError, match="middle of forgetting pose"):
         open_store(cell.folders["right"], unix_s=1)
 
     found = forget(cell.folders, ["pose"], now_ns=NOW_NS)

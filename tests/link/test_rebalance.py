@@ -198,7 +198,7 @@ def test_a_folder_in_the_midst_of_it_serves_nobody(tmp_path):
     assert killed_at(cell, THREE, first_copy + 1)
 
     for shard in ("left", "right", "third"):
-        with pytest.raises(StoreError, match=r"midst of a rebalance with .*left, right, third"):
+        with pytest.raises(StoreError, match=r"middle of a rebalance with .*left, right, third"):
             open_store(tmp_path / shard, unix_s=1)
     with pytest.raises(StoreError, match=r"of third; name their folders too, with --store"):
         rebalance({n: tmp_path / n for n in ("left", "right")}, TWO, unix_s=1)

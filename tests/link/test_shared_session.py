@@ -398,7 +398,7 @@ def test_aspects_are_registered_again_while_another_thread_registers_one(session
 
 
 def test_own_commits_are_noted_while_nobody_settles_others(session, monkeypatch):
-    """A note made in the midst of it would be lost, and its commit not shown to its own process."""
+    """A note made in the middle of it would be lost, and its commit not shown to its own process."""
     client, owned = session.client, []
     reached = Unsettled.reached
 

@@ -50,7 +50,7 @@ def test_connecting_and_closing_leaves_nothing_behind(process, endpoint):
 def dropped(users, until):
     """Let nobody refer to what uses a cell; return the warning of that.
 
-    A thread in the midst of a call may be the last that refers to it.
+    A thread in the middle of a call may be the last that refers to it.
     """
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always", ResourceWarning)

@@ -195,7 +195,7 @@ def test_shard_is_reached_again_soon_after_a_cut(whole):
 
 @pytest.mark.parametrize("fault", ["cut", "lost"])
 def test_network_does_what_it_is_told(whole, fault):
-    """The switch counts what it forwards, cuts and loses, in the midst of a cell's work."""
+    """The switch counts what it forwards, cuts and loses, in the middle of a cell's work."""
 
     def counted():
         counts = whole.hosts.counts()

@@ -147,7 +147,7 @@ class Shards:
             len(holders) > 1 and not self._under_way
         ):
             plan.obstacles.append(
-                f"the entity {entity} is on {' and '.join(sorted(holders))}, and nobody can say"
+                f"the entity {entity} is on {' and '.join(sorted(holders))}, and it is unknown"
                 " which of them is right; let the shard that should not have it begin with an empty"
                 " folder, or a backup from before it had it"
             )
@@ -263,8 +263,8 @@ class Shards:
         """Return how what is gone starts when it is made again: alike everywhere.
 
         What was made since began above the base of its own shard, and is known since that one
-        forgot the aspect, and goes on so; who has it before it moves is told as well, as a run that
-        is cut off may leave it there.
+        forgot the aspect, and goes on so; the shard that has it before it moves learns it as
+        well, as a run that is cut off may leave it there.
 
         Args:
             by_name: What each shard knows of what is gone.

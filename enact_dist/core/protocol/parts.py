@@ -151,8 +151,8 @@ class VersionEntry(NamedTuple):
     """One version of a slot's history, without its datum.
 
     `until_ns` is the stamp of the version that replaced it (0: it is the newest; its own stamp
-    where a label keeps it and the next one is forgotten).  `kept` are the labels under which
-    somebody has asked to keep it.  `cause` is None where it is not known.  What a restart has lost
+    where a label keeps it and the next one is forgotten).  `kept` are the labels that pin
+    it.  `cause` is None where it is not known.  What a restart has lost
     is version 0.
     """
 

@@ -323,8 +323,8 @@ class ForceAbort:
 class ListAudit:
     """List what operators did here.  Answer: `Audited`.
 
-    A text in `settle` says that somebody has seen to all alarms so far, and how.  `seen_ns` is the
-    wall-clock stamp of the newest act that this somebody had seen (0: unsaid): a late copy settles
+    A text in `settle` says that a person has seen to all alarms so far, and how.  `seen_ns` is the
+    wall-clock stamp of the newest act that this person had seen (0: unsaid): a late copy settles
     no alarm that came since.
     """
 

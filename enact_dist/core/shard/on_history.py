@@ -278,7 +278,7 @@ class HistoryDesk:
             "no_room",
             f"{len(message.versions)} versions were to be kept as {message.label!r}; with them"
             f" {kept} would be kept here, now of {history.kept_bytes} bytes; at most {KEPT_MAX} of"
-            f" {KEPT_BYTES_MAX} bytes can be; let go of labels that are not needed",
+            f" {KEPT_BYTES_MAX} bytes can be; release labels that are not needed",
         )
 
     def _is_going(self, version: SlotVersion) -> bool:

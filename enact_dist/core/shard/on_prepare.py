@@ -243,7 +243,7 @@ class PrepareDesk:
             under_way.replies += replies
             under_way.told = position
             return
-        # Never before what views were told of the lock, whatever its client has said elsewhere.
+        # Never before the stamp that views know of the lock, whatever its client said elsewhere.
         stamp_ns = max(position.stamp_ns, record.stamp_ns)
         self._state.stamps.saw(stamp_ns)
         cause = decided_cause(record, stamp_ns=stamp_ns)

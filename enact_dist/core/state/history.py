@@ -6,8 +6,8 @@ a slot is a tail of its history without holes.  Versions that labels keep are st
 without limit of time.
 
 Limits of the whole shard come before what an aspect retains: then the oldest goes first; at the cap
-of shared memory, the oldest of the aspects whose history has payloads there.  Whatever
-of a stored aspect is held no longer waits in here until the store is told, with the next batch.
+of shared memory, the oldest of the aspects whose history has payloads there.  Whatever of a stored
+aspect is held no longer waits in here until the store learns of it, with the next batch.
 """
 
 from __future__ import annotations

@@ -183,7 +183,7 @@ class Comparing:
         while (compare := self._next()) is not None:
             try:
                 found = serving(self._cell, compare.shard, compare.places, timeout_s=self.ASK_S)
-            except Exception as error:  # noqa: BLE001 - a place that somebody named may be anything
+            except Exception as error:  # noqa: BLE001 - a place from a configuration may be anything
                 if not self._closed:
                     _log.warning("endpoints of shard %s not compared: %s", compare.shard, error)
                 continue

@@ -118,7 +118,7 @@ def refuse_moving(folder: Path) -> None:
     if mark is not None:
         refuse(
             folder,
-            f"is in the midst of {mark.what} with those of {', '.join(mark.shards)}",
+            f"is in the middle of {mark.what} with those of {', '.join(mark.shards)}",
             way_out(mark),
         )
 

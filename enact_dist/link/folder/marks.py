@@ -67,11 +67,11 @@ def under_way(folders: Mapping[str, Path], *, forgets: bool = False) -> dict[str
     marks = {name: mark for name, folder in folders.items() if (mark := moving_mark(folder))}
     for name, mark in marks.items():
         if bool(mark.aspects) != forgets:
-            raise StoreError(f"shard {name} is in the midst of {mark.what}; {way_out(mark)} first")
+            raise StoreError(f"shard {name} is in the middle of {mark.what}; {way_out(mark)} first")
     if len({mark.number for mark in marks.values()}) > 1:
         which = "times that aspects were forgotten" if forgets else "rebalances"
         raise StoreError(
-            f"the folders of {', '.join(sorted(marks))} are in the midst of different {which};"
+            f"the folders of {', '.join(sorted(marks))} are in the middle of different {which};"
             " use the folders that belong to one run"
         )
     for name, mark in marks.items():

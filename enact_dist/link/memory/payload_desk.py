@@ -12,7 +12,7 @@ A payload lasts as long as its bytes are in use, a draft as long as its client.
 
 Rules that a change must keep:
 
-- A name is used once.  Readers learn of a payload only after its commit, so nobody reads a
+- A name is used once.  Readers learn of a payload only after its commit, so no reader sees a
   half-filled one.
 - Bytes count against the limit from before the file is made until it is gone.
 - A client that still has a draft mapped for writing could change it after the commit.  Our client

@@ -253,7 +253,7 @@ def _listen(folder: SharedFolder) -> socket.socket:
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         listener.bind(folder.address(SOCKET_NAME))
-        # Nobody reaches it before its mode is set: the folder keeps other users out, too.
+        # No client reaches it before its mode is set: the folder keeps other users out, too.
         Path(folder.address(SOCKET_NAME)).chmod(folder.access.socket_mode)
         listener.listen(BACKLOG)
     except OSError as error:

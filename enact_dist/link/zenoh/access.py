@@ -6,7 +6,7 @@ and its notices would reach every watcher.  With these rules only the shard answ
 publishes its notices and sees tokens.  They cost 15 us a call, need no keys, and check only key
 expressions; the shard itself checks everything else (see `enact_dist.core.shard.owners`).
 
-Zenoh drops forbidden messages silently: a query gets no reply, a declaration reaches nobody.  A
+Zenoh drops forbidden messages silently: a query gets no reply, a declaration reaches no peer.  A
 query passes only if its key is *included* in an allowed one, so a query with wildcards for several
 shards or verbs does not, except for the discovery of shards.
 """

@@ -57,8 +57,8 @@ def settle(patience_s: Mapping[tuple[int, int], float]) -> int:
     - A link in mid-transfer is closed only once the kernel has accepted the message being sent.
       Meanwhile everything that has a message for the link waits (zenoh issues 1053 and 1876),
       including the one thread that accepts connections and the one that sends for all.  When a
-      client was cut off during a fetch, its shard answered nobody for 6 s more with a TTL of 12 s.
-      A connection that the kernel has given up is closed at once.
+      client was cut off during a fetch, its shard answered no client for 6 s more with a TTL of
+      12 s.  A connection that the kernel has given up is closed at once.
     - Closing lingers for 10 s (zenoh issue 2350), until all is acknowledged: with a TTL of 2 s it
       took 12 s from a cut to the next grant, against 2.0 s now.  Without a linger time the kernel
       still sends the rest in the background.

@@ -1,6 +1,6 @@
 """What only processes can show: the cell with its robot while parts of it are killed or fail.
 
-One cell runs for all of these tests.  Each breaks something in the midst of a package, and ends when
+One cell runs for all of these tests.  Each breaks something in the middle of a package, and ends when
 it is known what became of that package; the next one takes the next package.
 """
 
@@ -223,7 +223,7 @@ def test_depth_sensor_that_is_blind_or_stands_still_is_looked_through_again(tria
 
 
 def test_push_outlives_the_restart_of_its_shard(trial: Trial) -> None:
-    """The shard with what the system requests is killed in midst of it; the net ends, and what it did is seen."""
+    """The shard with what the system requests is killed in middle of it; the net ends, and what it did is seen."""
     begun = trial.doing("push")
     os.kill(trial.processes.shard_pid("right"), signal.SIGKILL)
 

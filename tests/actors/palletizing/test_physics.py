@@ -489,7 +489,7 @@ def test_limiter_catches_up_after_commands_beyond_its_limits(kept_out):
 
 
 def test_arm_without_commands_comes_to_rest():
-    """An arm whose commands stay away in the midst of a motion stops by itself, near by."""
+    """An arm whose commands stay away in the middle of a motion stops by itself, near by."""
     cell = PhysicalCell([carton()], seed=1)
     cell.arm.start()
     q = np.array(HOME_RAD)

@@ -33,7 +33,7 @@ def played(scenario):
 
 
 def test_the_oracle_is_slower_near_a_person_and_the_zone_rests():
-    """Both run freely while nobody is there."""
+    """Both run freely while no person is there."""
     empty = scenario_of("S1", 1, 2.0)
     near = dataclasses.replace(
         scenario_of("S2", 1, 2.0),

@@ -409,7 +409,7 @@ def test_a_state_without_a_reason_is_one_word():
 def test_a_cell_without_commands_is_not_said_to_run():
     """Speed control, which says how the cell does, says so once per hull."""
     run, begun_ns = words.Safety("run", "", 0), 1_000_000_000
-    speed = words.Speed(1.0, 1.5, np.inf, "nobody is there", 250.0, begun_ns, begun_ns)
+    speed = words.Speed(1.0, 1.5, np.inf, "no person is there", 250.0, begun_ns, begun_ns)
 
     assert told(run, speed, begun_ns + 400_000_000) == ("run", "run")
     state, line = told(run, speed, begun_ns + 1_200_000_000)

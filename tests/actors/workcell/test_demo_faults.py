@@ -238,7 +238,7 @@ def test_a_command_that_rests_on_an_old_exposure_is_refused(trial: Trial) -> Non
         now_ns = time.time_ns()
         old_ns = now_ns - 1_000_000_000
         with Lock(request) as lock:
-            old = words.Speed(1.0, 1.5, np.inf, "nobody is there", 250.0, old_ns, old_ns)
+            old = words.Speed(1.0, 1.5, np.inf, "no person is there", 250.0, old_ns, old_ns)
             lock.put(request, old, stamp_ns=now_ns)
 
         def refused() -> words.Execution | None:

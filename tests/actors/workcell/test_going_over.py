@@ -19,7 +19,7 @@ CYCLE_NS = round(CYCLE_S * 1e9)
 LEFT = np.array([-1.0, 0.9, 0.0, -1.1, 0.0, 1.1, 0.0])
 RIGHT = np.array([0.9, 0.9, 0.0, -1.1, 0.0, 1.1, 0.0])
 UP = np.array([0.4, 0.3, 0.0, -1.1, 0.0, 1.1, 0.0])
-FULL = Speed(1.0, math.inf, math.inf, "nobody is there", 250.0, START_NS, START_NS)
+FULL = Speed(1.0, math.inf, math.inf, "no person is there", 250.0, START_NS, START_NS)
 
 
 def drawn(draw, points):

@@ -25,7 +25,7 @@ START_NS = 10**18
 MS = 1_000_000
 LEFT = np.array([-1.0, 0.9, 0.0, -1.1, 0.0, 1.1, 0.0])
 RIGHT = np.array([0.9, 0.9, 0.0, -1.1, 0.0, 1.1, 0.0])
-FULL = Speed(1.0, math.inf, math.inf, "nobody is there", 250.0, START_NS, START_NS)
+FULL = Speed(1.0, math.inf, math.inf, "no person is there", 250.0, START_NS, START_NS)
 
 
 def path_of(waypoints, number=1, reason="", planned_ns=START_NS):

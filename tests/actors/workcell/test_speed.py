@@ -49,7 +49,7 @@ SOUND = {
 @pytest.mark.parametrize(
     ("changes", "state", "text"),
     [
-        ({}, "run", "nobody is there"),
+        ({}, "run", "no person is there"),
         ({"nearest_m": 2.0}, "run", "2.00 m to the robot"),
         ({"nearest_m": 0.8}, "slow", "0.80 m to the robot allow 0.45 m/s"),
         ({"nearest_m": 0.5}, "stop", "0.50 m to the robot, 0.55 m are the least"),
