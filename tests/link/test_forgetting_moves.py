@@ -142,7 +142,9 @@ def test_a_rebalance_and_a_forgetting_wait_for_each_other(tmp_path):
         StoreError, match=r"of right; leave --shard out, or let .* --shard left --shard right --yes"
     ):
         forget({"left": cell.folders["left"]}, ["pose"], now_ns=NOW_NS)
-    with pytest.raises(StoreError, match=r"middle of forgetting pose; let `enact shard forget pose"):
+    with pytest.raises(
+        StoreError, match=r"middle of forgetting pose; let `enact shard forget pose"
+    ):
         rebalance(cell.folders, TWO, unix_s=1)
     (cell.folder / "left" / "moving").write_text('{"rebalance": "x", "shards": ["left", "right"]}')
     with pytest.raises(StoreError, match=r"middle of a rebalance; let `enact shard rebalance`"):

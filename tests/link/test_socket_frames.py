@@ -202,3 +202,16 @@ def test_payload_is_put_where_it_will_stay_if_it_fits(ends, room, placed):
     assert (header, bytes(payload)) == (b"head", body)
     assert (payload.obj is memory) == placed
     assert any(memory) == placed
+
+
+@pytest.mark.parametrize("other", [STREAM_VERSION - 1, STREAM_VERSION + 1])
+def test_stream_of_another_release_is_refused_with_both_versions(ends, other):
+    """The reader names the version that came, its own, and what to do."""
+    near, far = ends
+    near.sendall(struct.pack("<2sBBIQ", b"ED", other, Kind.MESSAGE, 0, 0))
+
+    said = (
+        f"a stream of version {other} came; this side speaks {STREAM_VERSION}; run the same release"
+    )
+    with pytest.raises(ProtocolError, match=said):
+        Stream(far).receive()

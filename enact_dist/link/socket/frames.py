@@ -309,11 +309,13 @@ def _read_prefix(buffer: bytearray | memoryview) -> tuple[int, int, int]:
         ProtocolError: It is invalid, or claims more than a frame's limit.
     """
     magic, version, kind, header_bytes, payload_bytes = _PREFIX.unpack_from(buffer)
-    if magic != MAGIC or version != STREAM_VERSION or kind not in _KINDS:
+    if magic == MAGIC and version != STREAM_VERSION:
         raise ProtocolError(
-            f"{bytes(buffer[:4])!r} starts no frame of a stream of version {STREAM_VERSION}; run"
-            " the same release of enact-dist in all processes of this host"
+            f"a stream of version {version} came; this side speaks {STREAM_VERSION}; run the same"
+            " release of enact-dist in all processes of this host"
         )
+    if magic != MAGIC or kind not in _KINDS:
+        raise ProtocolError(f"{bytes(buffer[:4])!r} starts no frame of enact-dist")
     if header_bytes > HEADER_BYTES_MAX or payload_bytes > PAYLOAD_BYTES_MAX:
         raise ProtocolError(
             f"a frame of {header_bytes} + {payload_bytes} bytes was announced; at most"
