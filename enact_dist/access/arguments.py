@@ -123,6 +123,17 @@ def check_seconds(name: str, found: object) -> None:
     raise MisuseError(f"{name} is {found!r}; it must be a number of seconds{remedy}")
 
 
+HOLD_S_MAX: Final = 24 * 3600.0
+"""How long a lock may be held at most."""
+
+
+def check_hold(name: str, found: object) -> None:
+    """Raise `MisuseError` unless an argument is a hold limit: over 0, at most a day."""
+    check_seconds(name, found)
+    if not 0.0 < float(found) <= HOLD_S_MAX:  # type: ignore[arg-type]  # a number, as just seen
+        raise MisuseError(f"{name} is {found!r}; it must lie in (0, {HOLD_S_MAX:g}] seconds")
+
+
 def check_reason(name: str, found: str) -> None:
     """Raise `MisuseError` unless a text may stand in the audit and in one line of a table."""
     if len(found) > REASON_CHARACTERS_MAX:

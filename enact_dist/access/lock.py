@@ -15,7 +15,7 @@ import threading
 import time
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
-from enact_dist.access.arguments import check_seconds
+from enact_dist.access.arguments import HOLD_S_MAX, check_hold, check_seconds
 from enact_dist.access.each import Block, WritableEach
 from enact_dist.access.reads import (
     EachData,
@@ -25,7 +25,7 @@ from enact_dist.access.reads import (
     refuse_changed,
     slot_of,
 )
-from enact_dist.access.session import session_of
+from enact_dist.access.session import bind, bound_before
 from enact_dist.access.statistics import LockStatistics
 from enact_dist.access.together import Together
 from enact_dist.access.trigger import Triggered
@@ -39,8 +39,7 @@ from enact_dist.errors import (
     MisuseError,
     ReadonlyError,
 )
-from enact_dist.terms import Access, Entity, refuse_duplicates
-from enact_dist.wire.limits import ITEMS_MAX
+from enact_dist.terms import Access, Entity
 from enact_dist.wire.payload import encode_parts
 
 if TYPE_CHECKING:
@@ -64,7 +63,6 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 R = TypeVar("R", bound="LockRequest[Any]")
 
-HOLD_S_MAX = 24 * 3600.0
 _thread = threading.local()
 
 
@@ -118,24 +116,12 @@ class Lock(Triggered):
     def __init__(
         self, *requests: LockRequest[Any], wait_s: float = 10.0, hold_s: float = 60.0
     ) -> None:
-        if not requests:
-            raise MisuseError("a lock of nothing: name at least one request")
-        if len(requests) > ITEMS_MAX:
-            raise MisuseError(
-                f"a lock with {len(requests)} requests; at most {ITEMS_MAX} are allowed. A pattern"
-                " (ReadEach, WriteEach, ViewEach) counts as one request and shows all matching"
-                f" data, but one lock writes at most {ITEMS_MAX}"
-            )
-        check_seconds("wait_s", wait_s)
-        check_seconds("hold_s", hold_s)
-        if not 0.0 < hold_s <= HOLD_S_MAX:
-            raise MisuseError(f"hold_s is {hold_s!r}; it must lie in (0, {HOLD_S_MAX:g}] seconds")
-        self._session = session_of(requests)
-        try:
-            refuse_duplicates(requests)
-        except ValueError as error:
-            raise MisuseError(str(error)) from None
-        self._requests = dict(zip(requests, requests, strict=True))
+        self._bound = bound_before(requests) or bind(requests)
+        if type(wait_s) is not float or not wait_s >= 0.0:
+            check_seconds("wait_s", wait_s)
+        if type(hold_s) is not float or not 0.0 < hold_s <= HOLD_S_MAX:
+            check_hold("hold_s", hold_s)
+        self._session, self._requests = self._bound.session, self._bound.requests
         self._wait_s, self._hold_s = wait_s, hold_s
         self._lock: MultiLock | None = None
         self._asking = self._over = False
@@ -156,28 +142,28 @@ class Lock(Triggered):
         return asked and not self._over and not self._session.client.forked
 
     def __enter__(self) -> Lock:
-        refuse_inside_lock("a second lock")
+        if getattr(_thread, "lock", None) is not None:
+            refuse_inside_lock("a second lock")
         if self._lock is not None or self._asking:
             raise LockReleasedError(f"{self!r} was used already; make a new lock")
-        client = self._session.client
-        prepared = self._session.prepare(self._requests, wait_s=self._wait_s)
+        session, client = self._session, self._session.client
+        prepared = session.prepare_bound(self._bound, wait_s=self._wait_s)
         begun: list[MultiLock] = []
         self._asked_s = time.monotonic()
         try:
             self._asking = True
             _thread.lock = self
             lock = client.acquire(
-                map(self._item_of, self._requests),
+                self._items(),
                 wait_s=self._wait_s,
                 hold_s=self._hold_s,
                 interrupt=self._interrupt,
                 begun=begun,
             )
-            self._session.check_shown(lock.states, self._requests, prepared)
+            if session.unknown or client.catalogue.lapses != prepared:
+                session.check_shown(lock.states, self._requests, prepared)
             self._granted_s = time.monotonic()
-            self._readings = Readings(
-                client, self._session.cache, lock.lock, lock.states, self._use
-            )
+            self._readings = Readings(client, session.cache, lock.lock, lock.states, self._use)
             self._readings.asked = self._requests
             self._lock = lock
             self._asking = False
@@ -189,8 +175,8 @@ class Lock(Triggered):
             raise
         return self
 
-    def _item_of(self, request: LockRequest[Any]) -> Item:
-        return self._session.item_of(request)
+    def _items(self) -> tuple[Item, ...]:
+        return self._session.items_of(self._bound)
 
     def __exit__(
         self,
@@ -213,14 +199,16 @@ class Lock(Triggered):
                 if shown or assigned:
                     refuse_changed(shown, assigned, self._writing.data, self._requests)
                 self._writing.fix()
-                writes = self._writing.by_shard(lock.shard_of)
-                reads = reads_of(self._readings, self._requests, self._each) if writes else ((), 0)
+                only = lock.parts[0].shard if len(lock.parts) == 1 else ""
+                writes = self._writing.by_shard(lock.shard_of, only)
+                reads = reads_of(self._readings, self._bound.reads if writes else (), self._each)
                 client.finish(lock, writes, tuple(self._expects.values()), *reads)
                 self.position = lock.position
         finally:
             # A commit leaves nothing to release; after an exception or interrupt this releases all.
             if not client.forked:
-                client.release(lock)
+                if not lock.lane_free:
+                    client.release(lock)
                 self._writing.end(committed=lock.phase in (Phase.COMMITTED, Phase.UNKNOWN))
             self._let_go()
 
@@ -264,15 +252,27 @@ class Lock(Triggered):
             NotRequestedError: The lock did not ask for it.
             LeaseLostError: The lock is lost.
         """
-        request = self._check(request)
-        if request.access.each:
-            return self._each_data(request)
-        return self._value(slot_of(request), request)
+        found = self._bound.single.get(id(request)) if self._held() else None
+        if found is None:
+            request = self._check(request)
+            if request.access.each:
+                return self._each_data(request)
+            return self._value(slot_of(request), request.aspect)
+        return self._value(found[0], found[1])
 
-    def _value(self, slot: Slot, request: Any) -> Any:
+    def _held(self) -> bool:
+        """Whether the block runs and nothing is known against the lock: the usual case."""
+        lock, client = self._lock, self._session.client
+        return (
+            lock is not None
+            and lock.phase is Phase.HELD
+            and not (self._over or client.forked or client.closed)
+        )
+
+    def _value(self, slot: Slot, aspect: Aspect[Any]) -> Any:
         if slot in self._writing.data:
-            return self._writing.written(slot, request.aspect)
-        return self._readings.value(slot, request.aspect)
+            return self._writing.written(slot, aspect)
+        return self._readings.value(slot, aspect)
 
     def _each_data(self, request: LockRequest[T]) -> EachData[T]:
         """Return the mapping of a pattern, made once: `lock[each][entity]` is used in loops."""
@@ -302,7 +302,7 @@ class Lock(Triggered):
         slot = slot_of(request)
         if self._is_null(slot):
             return default
-        value: T = self._value(slot, request)
+        value: T = self._value(slot, request.aspect)
         return value
 
     def is_null(self, request: LockRequestOne[Any]) -> bool:
@@ -333,8 +333,11 @@ class Lock(Triggered):
             DatumTypeError: The datum is not of the aspect's type.
             NoRoomError: The shard's cap of shared memory is reached.
         """
-        request = self._check_writable(request)
-        self._put(slot_of(request), request.aspect, datum, stamp_ns)
+        found = self._bound.single.get(id(request)) if self._held() else None
+        if found is None or not found[2]:
+            request = self._check_writable(request)
+            found = slot_of(request), request.aspect, True
+        self._put(found[0], found[1], datum, stamp_ns)
 
     def _put(self, slot: Slot, aspect: Aspect[T], datum: T, stamp_ns: int | None) -> None:
         try:

@@ -30,7 +30,7 @@ from enact_dist.errors import (
     NotRequestedError,
     NullDatumError,
 )
-from enact_dist.link.client.fetch import fetch_all
+from enact_dist.link.client.fetch import CACHED_BYTES_MIN, fetch_all
 from enact_dist.patterns import pattern_matches
 from enact_dist.terms import Access, Aspect, Entity, LockRequest, NullReason
 from enact_dist.wire import codecs
@@ -317,7 +317,10 @@ class Readings:
             reading = self._readings.get(slot)
             if reading is None or reading.state.null_reason:
                 raise self.null_error(slot)
-            datum, datum_type = self.datum(slot), aspect.datum_type
+            state, datum_type = reading.state, aspect.datum_type
+            datum = state.datum
+            if datum is None or state.large or datum.size >= CACHED_BYTES_MIN or self._kept:
+                datum = self.datum(slot)
             try:
                 value = decode_datum(datum, datum_type)
             except DatumTypeError as error:

@@ -22,8 +22,9 @@ from enact_dist.errors import (
 from enact_dist.link.client.calls import CALL_S
 from enact_dist.link.client.fetch import DatumCache
 from enact_dist.retention import checked_retention
-from enact_dist.terms import Entity, LockRequest
+from enact_dist.terms import Access, Entity, LockRequest, refuse_duplicates
 from enact_dist.wire.fingerprint import fingerprint
+from enact_dist.wire.limits import ITEMS_MAX
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -39,20 +40,81 @@ SETTLE_S: Final = 10.0
 SETTLE_SLICE_S: Final = 0.5
 ENTRIES_MAX: Final = 1024
 """Aspect objects whose catalogue entries are remembered."""
+BOUND_ITEMS_MAX: Final = 32
+BOUND_MAX: Final = 256
+"""Sets of so few requests, at most so many, are remembered as they were bound."""
 LOOKED_UP_S: Final = 1.0
 """So long the shards are not asked again about an aspect that is only read and not in use yet."""
 
 
+class BoundRequests:
+    """What the requests of a lock mean to a session, worked out once for each set of them.
+
+    Args:
+        session: The session of all of them.
+        requests: The requests, checked.
+
+    Attributes:
+        requests: Each request by itself.
+        single: For each request of one entity, by its `id`: its slot, aspect, and whether it allows
+            writing.  The requests are kept here, so their ids stay theirs.
+        reads: The slots of those that show one datum and do not write it.
+        items: The lines of the protocol, as asked for while no datum is cached.
+        known_at: The state of the catalogues in which all aspects were found settled.
+    """
+
+    __slots__ = ("items", "known_at", "reads", "requests", "session", "single", "slots")
+
+    def __init__(self, session: Session, requests: tuple[LockRequest[Any], ...]) -> None:
+        self.session = session
+        self.requests = dict(zip(requests, requests, strict=True))
+        self.single: dict[int, tuple[Slot, Aspect[Any], bool]] = {}
+        items = []
+        for request in self.requests:
+            items.append(Item(int(request.access), *request.address))
+            if not request.access.each:
+                slot = slot_of(request)
+                self.single[id(request)] = slot, request.aspect, request.access is Access.WRITE
+        self.items = tuple(items)
+        self.slots = [slot for slot, _, _ in self.single.values()]
+        self.reads = [slot for slot, _, writable in self.single.values() if not writable]
+        self.known_at: object = None
+
+
 class Session:
-    """One connection of this process to a cell, behind `Cell`, `WorldContext` and `Lock`."""
+    """One connection of this process to a cell, behind `Cell`, `WorldContext` and `Lock`.
+
+    Attributes:
+        bound: The sets of requests that were bound here, by the ids of their requests.
+        unknown: Aspects that are only read and that no shard knew when they were looked up.
+    """
 
     def __init__(self, client: CellClient) -> None:
         self.client = client
+        self.bound: dict[tuple[int, ...], BoundRequests] = {}
         self.cache = DatumCache()
         self._entries: dict[int, tuple[Aspect[Any], AspectEntry, AspectEntry]] = {}
         self._looked_up: dict[AspectEntry, float] = {}
         self._lapses = 0
-        self._unknown: set[AspectEntry] = set()
+        self.unknown: set[AspectEntry] = set()
+
+    def prepare_bound(self, bound: BoundRequests, *, wait_s: float) -> int:
+        """`prepare` for the requests of a lock; at once where the catalogues have not changed."""
+        client = self.client
+        catalogue = client.catalogue
+        state = catalogue.state
+        if bound.known_at is state and state[0] is client.core.placement:
+            return catalogue.lapses
+        prepared = self.prepare(bound.requests, wait_s=wait_s)
+        if client.knows(self._entries_of(bound.requests)[0]):
+            bound.known_at = state  # as it was before: a change meanwhile is looked at next time
+        return prepared
+
+    def items_of(self, bound: BoundRequests) -> tuple[Item, ...]:
+        """Return the protocol's lines for bound requests, with the versions that are cached."""
+        if self.cache.holds_none(bound.slots):
+            return bound.items
+        return tuple(map(self.item_of, bound.requests))
 
     def prepare(self, requests: Iterable[LockRequest[Any]], *, wait_s: float | None = None) -> int:
         """Make sure that the aspects of a lock or view can be used: register what it may write.
@@ -70,15 +132,7 @@ class Session:
             ShardUnreachableError: A shard that is asked does not answer.
         """
         prepared = self._see_lapses()
-        written: set[str] = set()
-        aspects: dict[str, Aspect[Any]] = {}
-        entries: list[AspectEntry] = []
-        for request in requests:
-            aspects[request.aspect.name] = request.aspect
-            if request.access.writes:
-                written.add(request.aspect.name)
-        for name, aspect in aspects.items():
-            entries.append(self._entry(aspect, reads=name not in written))
+        entries, written = self._entries_of(requests)
         if self.client.knows(entries):
             return prepared
         patience_s = self.client.patience_s
@@ -96,9 +150,18 @@ class Session:
             self._look_up(read, lambda: self.shards_of(reading), timeout_s)
         return prepared
 
+    def _entries_of(
+        self, requests: Iterable[LockRequest[Any]]
+    ) -> tuple[list[AspectEntry], set[str]]:
+        """Return the catalogue's entries of all aspects, and the names of those to be written."""
+        aspects = {request.aspect.name: request.aspect for request in requests}
+        written = {request.aspect.name for request in requests if request.access.writes}
+        entries = [self._entry(one, reads=name not in written) for name, one in aspects.items()]
+        return entries, written
+
     def _see_lapses(self) -> int:
         """Return how often a shard has forgotten an aspect; what was looked up before is void."""
-        lapses = self.client.lapses
+        lapses = self.client.catalogue.lapses
         if lapses != self._lapses:
             self._lapses = lapses
             self._looked_up.clear()
@@ -151,7 +214,7 @@ class Session:
         due = [e for e in entries if now_s >= self._looked_up.get(e, -LOOKED_UP_S) + LOOKED_UP_S]
         lacking = client.lacking(due, needed)
         if not lacking:
-            self._unknown.difference_update(due)
+            self.unknown.difference_update(due)
             return
         client.greet(lacking, timeout_s=timeout_s)
         known = client.aspect_entries()
@@ -166,10 +229,10 @@ class Session:
             client.register(aspects=as_known, needed=needed, timeout_s=timeout_s)
         if len(self._looked_up) >= ENTRIES_MAX:
             self._looked_up.clear()
-            self._unknown.clear()
+            self.unknown.clear()
         self._looked_up.update(dict.fromkeys(due, now_s))
-        self._unknown -= set(used)
-        self._unknown |= set(due) - set(used)
+        self.unknown -= set(used)
+        self.unknown |= set(due) - set(used)
 
     def check_shown(
         self, readings: Iterable[Reading], requests: Iterable[LockRequest[Any]], prepared: int
@@ -188,19 +251,19 @@ class Session:
             DatumTypeError: One has another type.
             ShardUnreachableError: A shard does not answer.
         """
-        if self.client.lapses != prepared:
+        if self.client.catalogue.lapses != prepared:
             self.prepare(requests, wait_s=CALL_S)
-        if not self._unknown:
+        if not self.unknown:
             return  # the usual case
         shown = [one.state.slot for one in readings if not one.state.null_reason]
         names = {slot.aspect for slot in shown}
         wanted = {
             self._entry(one.aspect, reads=True) for one in requests if one.aspect.name in names
         }
-        entries = [entry for entry in wanted if entry in self._unknown]
+        entries = [entry for entry in wanted if entry in self.unknown]
         for entry in entries:
             self._looked_up.pop(entry, None)
-            self._unknown.discard(entry)  # whatever comes out, it is not unknown any more
+            self.unknown.discard(entry)  # whatever comes out, it is not unknown any more
         if entries:
             new = {entry.name for entry in entries}
             placement = self.client.core.placement
@@ -323,6 +386,41 @@ def _remedy(request: object) -> str:
             " complete set without a lock, world.view(together)"
         )
     return "use Read, Write, View or …Each"
+
+
+def bound_before(requests: tuple[LockRequest[Any], ...]) -> BoundRequests | None:
+    """Return what the requests of a lock mean if exactly these were bound before."""
+    world = getattr(requests[0], "world", None) if requests else None
+    session: Session | None = getattr(world, "session", None)
+    return session.bound.get(tuple(map(id, requests))) if session is not None else None
+
+
+def bind(requests: tuple[LockRequest[Any], ...]) -> BoundRequests:
+    """Return what the requests of a lock mean; remembered for sets of a few requests.
+
+    Raises:
+        MisuseError: There are none or too many, one datum is named twice with different accesses,
+            or as `session_of`.
+    """
+    if not requests:
+        raise MisuseError("a lock of nothing: name at least one request")
+    if len(requests) > ITEMS_MAX:
+        raise MisuseError(
+            f"a lock with {len(requests)} requests; at most {ITEMS_MAX} are allowed. A pattern"
+            " (ReadEach, WriteEach, ViewEach) counts as one request and shows all matching"
+            f" data, but one lock writes at most {ITEMS_MAX}"
+        )
+    session = session_of(requests)
+    try:
+        refuse_duplicates(requests)
+    except ValueError as error:
+        raise MisuseError(str(error)) from None
+    bound = BoundRequests(session, requests)
+    if len(requests) <= BOUND_ITEMS_MAX:
+        if len(session.bound) >= BOUND_MAX:
+            session.bound.clear()
+        session.bound[tuple(map(id, requests))] = bound
+    return bound
 
 
 def session_of(requests: tuple[LockRequest[Any], ...], *, view: bool = False) -> Session:

@@ -22,9 +22,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias, cast
 
-from enact_dist.access.reads import Shown, changeable, misfit, null_error, slot_of
+from enact_dist.access.reads import Shown, changeable, misfit, null_error
 from enact_dist.core.protocol.datum import Datum, Slot
 from enact_dist.core.protocol.messages import WriteItem
 from enact_dist.core.protocol.parts import READS_MAX
@@ -55,7 +56,7 @@ if TYPE_CHECKING:
 
 def reads_of(
     readings: Readings,
-    requests: Iterable[LockRequest[Any]],
+    single: Iterable[Slot],
     each: Mapping[LockRequest[Any], EachData[Any]],
 ) -> tuple[tuple[DatumRead, ...], int]:
     """Return what a lock has read, and how many further data a commit does not name.
@@ -64,15 +65,11 @@ def reads_of(
 
     Args:
         readings: What it was shown, and what of it was looked at.
-        requests: What it asked for.
+        single: The data that it asked for one by one, not to write them.
         each: The mappings of its patterns that were used.
     """
     looked_at = readings.looked_at
-    slots: dict[Slot, None] = {}
-    for request in requests:
-        access = request.access
-        if not (access.writes or access.each):
-            slots[slot_of(request)] = None
+    slots = dict.fromkeys(single)
     slots.update(dict.fromkeys(looked_at))
     for request, data in each.items():
         if not request.access.writes:
@@ -83,6 +80,9 @@ def reads_of(
         return (), 0
     reads = readings.versions(slots)
     return reads[:READS_MAX], max(0, len(reads) - READS_MAX)
+
+
+_write_of: Final = partial(tuple.__new__, WriteItem)
 
 
 class _Written(NamedTuple):
@@ -134,8 +134,12 @@ class Writing:
         self.edits = 0
         self.looked_at: dict[Slot, Shown] = {}
 
-    def by_shard(self, shard_of: Callable[[Slot], str]) -> dict[str, list[WriteItem]]:
-        """Return what each shard has to set."""
+    def by_shard(
+        self, shard_of: Callable[[Slot], str], only: str = ""
+    ) -> Mapping[str, Sequence[WriteItem]]:
+        """Return what each shard has to set; `only` names the one that has all, if one has."""
+        if only:
+            return {only: tuple(map(_write_of, self.data.items()))} if self.data else {}
         by_shard: dict[str, list[WriteItem]] = {}
         for slot, datum in self.data.items():
             by_shard.setdefault(shard_of(slot), []).append(WriteItem(slot, datum))
@@ -149,7 +153,13 @@ class Writing:
             NoRoomError: The shard's cap is reached.
         """
         size = self._size_with(slot, encoded.size)
-        self._note(slot, self._written(slot, encoded, shard_of), size)
+        if encoded.size <= PAYLOAD_BYTES_MIN and slot not in self._by_slot:
+            self.data[slot] = encoded.datum()
+            self.looked_at.pop(slot, None)
+            self._bytes = size
+            self.edits += 1
+        else:
+            self._note(slot, self._written(slot, encoded, shard_of), size)
 
     def written(self, slot: Slot, aspect: Aspect[Any]) -> Any:
         """Return the value that a slot was set to.

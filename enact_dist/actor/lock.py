@@ -66,7 +66,7 @@ class ActorLock(Lock):
         super().__init__(*bound.values(), wait_s=wait_s, hold_s=hold_s)
         self._interrupt = stop
         self._entity = entity
-        self._bound = bound
+        self._declared = bound
         self._together = together
         self._captured_ns = min(filter(None, members), default=0)
         self._tick_ns = tick_ns
@@ -74,8 +74,11 @@ class ActorLock(Lock):
         stamps = together.stamps(members) if together is not None else {}
         self._in_set: dict[Any, int] = {bound[view]: stamp for view, stamp in stamps.items()}
 
-    def _item_of(self, request: LockRequest[Any]) -> Item:
-        return self._session.item_of(request, self._in_set.get(request, 0))
+    def _items(self) -> tuple[Item, ...]:
+        if not self._in_set:
+            return super()._items()
+        of, stamps = self._session.item_of, self._in_set
+        return tuple([of(request, stamps.get(request, 0)) for request in self._requests])
 
     @property
     def missing(self) -> tuple[View[Any], ...]:
@@ -108,7 +111,7 @@ class ActorLock(Lock):
     def _resolve(self, request: R) -> R:
         """Return the bound form of a declared request in this update."""
         if isinstance(request, LockRequest) and isinstance(request.world, World):
-            return cast("R", self._bound.get(request, request))
+            return cast("R", self._declared.get(request, request))
         return request
 
     def granted_states(self, declared: LockRequest[Any]) -> dict[Entity, tuple[int, int]]:

@@ -11,20 +11,15 @@ A carrier decides nothing.  Every carrier keeps these rules:
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, Final, Protocol, get_args
+from typing import TYPE_CHECKING, Final, Protocol
 
-from enact_dist.core.protocol.messages import Answer
-from enact_dist.errors import ConfigError, LinkError, MisuseError, ProtocolError
-from enact_dist.wire.frames import decode_frame
+from enact_dist.errors import ConfigError, LinkError, MisuseError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from enact_dist.core.protocol.messages import Notice, Request, ShardEntry, Survey
+    from enact_dist.core.protocol.messages import Answer, Notice, Request, ShardEntry, Survey
     from enact_dist.link.notices import Skipped
-
-
-_ANSWERS: Final = frozenset(get_args(Answer))
 
 
 FORKED_REMEDY: Final = (
@@ -63,18 +58,6 @@ def failure_of(failures: Mapping[str, Exception]) -> Exception:
     text = "; ".join(f"shard {shard}: {error}" for shard, error in failures.items())
     for_good = all(isinstance(error, ConfigError) for error in failures.values())
     return ConfigError(text) if for_good else LinkError(text)
-
-
-def read_answer(shard: str, header: bytes, payload: bytes | memoryview) -> Answer:
-    """Return the answer that a shard's frame carries.
-
-    Raises:
-        ProtocolError: It cannot be read or is no answer.
-    """
-    answer = decode_frame(header, payload)
-    if type(answer) not in _ANSWERS:
-        raise ProtocolError(f"shard {shard} answered with a {type(answer).__name__}")
-    return answer  # type: ignore[return-value]  # one of these
 
 
 class NoticeFeed(Protocol):

@@ -262,7 +262,7 @@ class Replay:
         slots = [self._slot(recorded.slot) for recorded in versions]
         session = next(iter(self._sessions.values()))
         client = session.client
-        prepared = client.lapses
+        prepared = client.catalogue.lapses
         self._register(session, versions)
         items = [Item(int(Access.WRITE), *slot) for slot in slots]
         writing = Writing(client.payloads)
@@ -270,7 +270,7 @@ class Replay:
         self._others.look_at(session, lock)
         committed = False
         try:
-            if client.lapses != prepared:  # a shard has restarted and forgotten an aspect
+            if client.catalogue.lapses != prepared:  # a shard has restarted and forgotten an aspect
                 self._registered.clear()
                 self._register(session, versions)
             for slot, recorded in zip(slots, versions, strict=True):

@@ -113,6 +113,7 @@ CODES: Final[dict[type[Any], int]] = {
     m.Notice: 97,
 }
 
+_VERSION: Final = bytes((FRAME_VERSION,))
 _limits: Final = {
     "use_list": False,
     "max_str_len": TEXT_BYTES_MAX,
@@ -195,7 +196,7 @@ def _decoded(
             f"a frame of {len(header)} + {len(payload)} bytes came; at most {HEADER_BYTES_MAX} +"
             f" {PAYLOAD_BYTES_MAX}"
         )
-    if len(header) < 2 or header[1] != FRAME_VERSION or not 0x92 <= header[0] <= 0x9F:
+    if header[1:2] != _VERSION or not 0x92 <= header[0] <= 0x9F:
         _check_version(header)
     try:
         values = unpack(header)
@@ -218,6 +219,18 @@ def _decoded(
             " to it"
         )
     return message
+
+
+def decode_answer(shard: str, header: bytes, payload: bytes | memoryview = b"") -> m.Answer:
+    """Return the answer that a shard's frame carries.
+
+    Raises:
+        ProtocolError: As `decode_frame`; it is no answer.
+    """
+    answer = _decoded(header, payload, _unpack)
+    if type(answer) not in _ANSWERS:
+        raise ProtocolError(f"shard {shard} answered with a {type(answer).__name__}")
+    return answer  # type: ignore[return-value]  # one of these
 
 
 def decode_request(header: bytes, payload: bytes | memoryview = b"") -> m.Request:
@@ -257,6 +270,7 @@ _NO_BODIES: Final = BodyReader(b"")
 """For all frames without a payload: nothing can be taken from it, so it never changes."""
 _writers: Final = {cls: (code, values_of(cls), writers_of(cls)) for cls, code in CODES.items()}
 _REQUESTS: Final = frozenset(get_args(m.Request))
+_ANSWERS: Final = frozenset(get_args(m.Answer))
 _COMMITS: Final = frozenset((m.Commit, m.Prepare))
 _OF_EVERY_LOCK: Final = frozenset(
     (

@@ -100,15 +100,18 @@ def writers_of(cls: type[Any]) -> list[tuple[int, Write]]:
     return [(index, write) for index, write in enumerate(writers) if write is not None]
 
 
+def _write_datum(datum: Datum | None, bodies: BodyWriter) -> Any:
+    return None if datum is None else bodies.add(datum)
+
+
 def _writer_of(kind: Any) -> Write | None:
     kind = without_none(kind)
     if kind is Datum:
-        return lambda datum, bodies: None if datum is None else bodies.add(datum)
+        return _write_datum
     if get_origin(kind) is tuple:
-        write_one = _writer_of(get_args(kind)[0])
-        if write_one is None:
-            return None
-        return lambda values, bodies: [write_one(value, bodies) for value in values]
+        each = get_args(kind)[0]
+        writers = [] if each in SCALARS else writers_of(each)
+        return _writer_of_each(writers) if writers else None
     writers = [] if kind in SCALARS else writers_of(kind)
     return _writer_of_part(writers) if writers else None
 
@@ -119,6 +122,24 @@ def _writer_of_part(writers: list[tuple[int, Write]]) -> Write:
         for index, write_part in writers:
             parts[index] = write_part(parts[index], bodies)
         return parts
+
+    return write
+
+
+def _writer_of_each(writers: list[tuple[int, Write]]) -> Write:
+    """Return what prepares a list of parts; those of a lock have one datum each."""
+    (index, write_one), *more = writers
+    write_part = _writer_of_part(writers)
+
+    def write(values: Any, bodies: BodyWriter) -> list[Any]:
+        if more:
+            return [write_part(value, bodies) for value in values]
+        written = []
+        for value in values:
+            parts = list(value)
+            parts[index] = write_one(parts[index], bodies)
+            written.append(parts)
+        return written
 
     return write
 

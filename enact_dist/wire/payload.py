@@ -63,7 +63,8 @@ class Encoded:
 
     def datum(self) -> Datum:
         """Return the datum, with a copy of the bytes."""
-        return Datum(self.encoding, joined(self.parts, self.size), self.size, self.stamp_ns)
+        body = joined(self.parts, self.size) if self.parts else b""
+        return Datum(self.encoding, body, self.size, self.stamp_ns)
 
     def over(self, body: memoryview, file: str) -> Datum:
         """Return the datum whose bytes were copied, or will be made, elsewhere."""

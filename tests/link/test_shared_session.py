@@ -344,14 +344,14 @@ def test_shards_in_use_can_be_listed_while_another_thread_learns_of_one():
     class Met(Peer):
         @property
         def epoch(self):
-            client._peer("s1")
+            client.peer("s1")
             return 1
 
         @epoch.setter
         def epoch(self, _):
             pass
 
-    client._peers["s0"] = Met()
+    client.peers["s0"] = Met()
 
     assert client.shards_in_use() == ["s0"]
 
@@ -381,20 +381,20 @@ def test_aspects_are_registered_again_while_another_thread_registers_one(session
         __hash__ = str.__hash__
 
         def __eq__(self, other):
-            client._catalogue.wants([COUNT._replace(name="new")])
+            client.catalogue.wants([COUNT._replace(name="new")])
             return str.__eq__(self, other)
 
     item = SimpleNamespace(aspect=Name("count"))
     plan = SimpleNamespace(locks=[("shard", (item,))], views=[])
     code = SimpleNamespace(code="unknown_aspect")
     refused = SimpleNamespace(plan=plan, phase=None, refusal=code)
-    client._catalogue.wants([COUNT])
+    client.catalogue.wants([COUNT])
     monkeypatch.setattr(client, "register", lambda **named: wanted.append(named["aspects"]))
     monkeypatch.setattr("enact_dist.link.client.locks.Refused", SimpleNamespace)
 
     assert client._begins_anew(refused, 0)
     assert wanted == [[COUNT]]
-    assert {entry.name for entry in client._catalogue.wanted({"count", "new"})} == {"count", "new"}
+    assert {entry.name for entry in client.catalogue.wanted({"count", "new"})} == {"count", "new"}
 
 
 def test_own_commits_are_noted_while_nobody_settles_others(session, monkeypatch):

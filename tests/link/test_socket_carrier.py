@@ -359,7 +359,7 @@ def test_connection_that_is_given_back_while_the_line_closes_is_closed(daemon, c
             line.close()
             super().append(given)
 
-    line._idle = Closing()
+    line.idle = Closing()
     line.give_back(connection)
 
     assert connection.socket.fileno() == -1
@@ -391,7 +391,7 @@ def test_call_on_a_connection_that_was_just_closed_takes_the_other_way(daemon, c
     """Another thread may close an idle connection while one takes it: nobody is shown EBADF."""
     daemon(endpoint)
     carrier = carry(endpoint)
-    carrier._lines["s0"]._idle[-1].socket.close()
+    carrier._lines["s0"].idle[-1].socket.close()
 
     answers = carrier.request_all([("s0", ListLocks())], timeout_s=30)
     answers.append(carrier.request("s0", ListLocks(), timeout_s=30))

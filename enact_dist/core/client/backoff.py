@@ -7,6 +7,9 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
+RETRY_NS_MIN: Final = 20_000_000
+RETRY_NS_MAX: Final = 300_000_000
+"""Pause after a call without an answer; doubles up to the second figure."""
 CALLED_NS_MIN: Final = 5_000_000_000
 CALLED_NS_MAX: Final = 20_000_000_000
 """Pauses of a client that waits for a shard out of reach, from the first to the longest.

@@ -68,7 +68,8 @@ class Client(ClientSession[MultiLock]):
         `past_ns` they are views alone, as of that stamp.
         """
         items = tuple(items)
-        usual = not lock_views and not self.unsettled and len(items) <= PLANNED_MAX
+        unsettled = self.unsettled.by_slot or self.unsettled.by_shard
+        usual = not lock_views and not unsettled and len(items) <= PLANNED_MAX
         plan = self._plans.get(items) if usual else None
         if plan is None:
             plan = self._planned(items, lock_views=lock_views)

@@ -41,6 +41,7 @@ class Sendings:
 
     def believe_until_ns(self, count_seen: int, duration_ns: int) -> int:
         """Return until when something granted for `duration_ns` may be believed in (0: not)."""
-        if not max(0, self.count - SENDINGS_KEPT) < count_seen <= self.count:
+        count = self.count
+        if not 0 < count_seen <= count < count_seen + SENDINGS_KEPT:
             return 0
         return self._sent[count_seen % SENDINGS_KEPT] + duration_ns * _SAFE_PER_CENT // 100

@@ -23,6 +23,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.core.client.backoff import RETRY_NS_MAX, RETRY_NS_MIN
 from enact_dist.core.client.cut import ROUNDS_MAX, Cut
 from enact_dist.core.client.finishing import Finishing, by_shard, tokens_of
 from enact_dist.core.client.plan import OF_SESSIONS, Part, Phase, Plan, Reading, first_asking
@@ -66,17 +67,14 @@ if TYPE_CHECKING:
 
 WAIT_SLICE_NS: Final = 900_000_000
 """How long one call of a waiting lock is parked; below the shard's own limit of 1 s."""
-RETRY_NS_MIN: Final = 20_000_000
-RETRY_NS_MAX: Final = 300_000_000
-"""Pause after a call without an answer; doubles up to the second figure."""
 OVERLOAD: Final = "overload"
 """The code of refusals by a shard that has not looked at the request."""
-_TO_ANY_REQUEST: Final = (Refused, Forgotten, WrongShard, EpochChanged)  # a union is slower
+_TO_ANY_REQUEST: Final = frozenset((Refused, Forgotten, WrongShard, EpochChanged))
 _DECIDERS: Final = (Commit, Outcome)
 
 FREE_CALLS: Final = 3
-"""Calls after a step forward that are made though the time to wait is over: a lock that does not
-want to wait asks each shard once, and again where a shard has restarted."""
+"""Calls after each step that are made even once time is up: a lock with `wait_s=0` asks each shard
+once, and again after a restart."""
 
 
 @dataclass(slots=True, eq=False)
@@ -103,6 +101,7 @@ class MultiLock:
     lane_free: bool = False
     farewells: list[tuple[str, Request]] = field(default_factory=list)
     cut: Cut | None = None
+    unnamed: bool = False  # its bytes travel: the shard has lost the payloads that it named
     _finishing: Finishing | None = None
     _free_calls: int = FREE_CALLS
     _retry_at_ns: int = 0
@@ -129,16 +128,14 @@ class MultiLock:
             return [], 0
         if now_ns < self._retry_at_ns:
             return [], min(self._retry_at_ns, self.give_up_ns)
-        calls = self._calls(now_ns)
-        strangers: dict[str, None] = {}
-        for shard, _ in calls:
-            if self.client.needs_hello(shard):
-                strangers[shard] = None
-        return [(shard, self.client.hello(shard)) for shard in strangers] if strangers else calls, 0
+        acquires = self.phase is Phase.ACQUIRING
+        calls = [self._acquire(now_ns)] if acquires else self._calls(now_ns)
+        if not self.client.greeted.issuperset(dict(calls)):
+            strangers = [shard for shard in dict(calls) if self.client.needs_hello(shard)]
+            return [(shard, self.client.hello(shard)) for shard in strangers], 0
+        return calls, 0
 
     def _calls(self, now_ns: int) -> list[tuple[str, Request]]:
-        if self.phase is Phase.ACQUIRING:
-            return [self._acquire(now_ns)]
         if self.cut is not None and self.phase is Phase.VIEWING:
             return [(shard, self._view(shard, self.cut, now_ns)) for shard in self.cut.left]
         finishing = self._finishing
@@ -151,23 +148,24 @@ class MultiLock:
         return [(finishing.primary, finishing.commit(self.client.seen_stamp_ns))]
 
     def _acquire(self, now_ns: int) -> tuple[str, Request]:
-        part = first_asking(self.parts)
+        parts, client = self.parts, self.client
+        part = parts[0] if len(parts) == 1 else first_asking(parts)
         assert part is not None
         left_ns = max(0, self.give_up_ns - now_ns)
-        last = part is self.parts[-1]
         # The hold limit counts from the last grant; earlier ones must outlast the waiting too.
-        hold_ns = self.hold_ns if last else self.hold_ns + left_ns
+        hold_ns = self.hold_ns if part is parts[-1] else self.hold_ns + left_ns
+        peer = client.peer(part.shard)
         return part.shard, Acquire(
             self.lock,
-            self.client.epoch(part.shard),
+            peer.epoch,
             self.plan.placement.version,
-            self.client.sendings.next(now_ns),
+            client.sendings.next(now_ns),
             part.items,
             min(self.slice_ns, left_ns),
             hold_ns,
-            self.client.seen_stamp_ns,
-            alone=len(self.parts) == 1 and not self.plan.views,
-            successions=self.client.successions(part.shard),
+            client.seen_stamp_ns,
+            len(parts) == 1 and not self.plan.views,
+            peer.successions,
         )
 
     def _view(self, shard: str, cut: Cut, now_ns: int) -> Request:
@@ -190,13 +188,16 @@ class MultiLock:
         if answer is None or (isinstance(answer, Refused) and self._undecided(request, answer)):
             self._silent(shard, request, now_ns)
             return
-        if isinstance(answer, OF_SESSIONS) and self.client.answered(shard, request, answer, now_ns):
+        kind = type(answer)
+        if kind in OF_SESSIONS and self.client.answered(shard, request, answer, now_ns):
             return  # it was about the session, not about this lock
+        if kind is Granted and self.client.unsettled.by_slot:
+            self.client.unsettled.shown(shard, answer.states)  # type: ignore[union-attr]
         if self.silent_shard == shard:
             self.silent_shard = ""
         self._retry_ns = RETRY_NS_MIN
-        if isinstance(answer, _TO_ANY_REQUEST):
-            self._on_refusal(shard, request, answer)
+        if kind in _TO_ANY_REQUEST:
+            self._on_refusal(shard, request, answer)  # type: ignore[arg-type]  # one of these
         elif getattr(answer, "lock", None) != self.lock:
             return
         elif self.phase is Phase.ACQUIRING:
@@ -217,6 +218,7 @@ class MultiLock:
         elif isinstance(answer, Refused | Forgotten):
             code = answer.code if isinstance(answer, Refused) else ""
             if code == NO_PAYLOAD and self._finishing and self._finishing.unname(request):
+                self.unnamed = True
                 return  # asked again, with the bytes
             self._end(Phase.REFUSED)
             self.refusal = answer
@@ -227,10 +229,9 @@ class MultiLock:
             self._epoch_changed(shard, request)
 
     def _undecided(self, request: Request, answer: Refused) -> bool:
-        """Whether it is a refusal that leaves open what became of a commit that was sent.
+        """Whether a refusal leaves open what became of a commit that was sent.
 
-        Refusing the commit itself ends its lock, but a shard that is too busy has not looked at
-        it: an earlier copy may have been applied, or still be.
+        A busy shard has not looked at this copy; an earlier one may have been applied.
         """
         if self.phase is not Phase.COMMITTING or not self.sent_commit:
             return False
@@ -263,20 +264,23 @@ class MultiLock:
         # grant has already ended this lock through `lose_at`.
 
     def _on_acquiring(self, shard: str, answer: Answer, now_ns: int) -> None:
-        part = first_asking(self.parts)
+        parts, client = self.parts, self.client
+        part = parts[0] if parts[0].token is None else first_asking(parts)
         if part is None or part.shard != shard:
             return
         if isinstance(answer, Granted):
-            if answer.epoch != self.client.epoch(shard):
-                return  # a grant of an epoch that is over
-            part.granted(answer, self.client.sendings, ttl_ns=self.client.ttl_ns)
-            self.client.saw_stamp(answer.stamp_ns)
             epoch = answer.epoch
-            for state in answer.states:
-                self.states.append(Reading(shard, epoch, state))
+            if epoch != client.peers[shard].epoch:
+                return  # a grant of an epoch that is over
+            part.granted(answer, client.sendings, ttl_ns=client.ttl_ns)
+            client.saw_stamp(answer.stamp_ns)
+            self.states += [Reading(shard, epoch, state) for state in answer.states]
             if self.cut is not None:
                 self.cut.not_before(answer.from_ns)
-            self._advance()
+            if part is parts[-1] and not self.plan.views:
+                self.phase = Phase.HELD
+            else:
+                self._advance()
         elif isinstance(answer, Waiting):
             self.blockers = answer.blockers
             self._free_calls = 0
@@ -410,15 +414,9 @@ class MultiLock:
         self._free_calls = self._retry_at_ns = 0
         expected = by_shard(expects, self.plan.placement) if expects else {}
         viewed = {shard: self._epoch_viewed(shard) for shard in expected} if expected else {}
-        tokens = tokens_of(self.parts, viewed)
-        self._finishing = Finishing(
-            self.lock,
-            tokens,
-            {shard: tuple(items) for shard, items in writes.items() if items},
-            expected,
-            tuple(reads),
-            reads_left_out,
-        )
+        written = {shard: tuple(items) for shard, items in writes.items() if items}
+        tokens, reads = tokens_of(self.parts, viewed), tuple(reads)
+        self._finishing = Finishing(self.lock, tokens, written, expected, reads, reads_left_out)
         self.phase = Phase.VALIDATING
         self._after_votes()
 

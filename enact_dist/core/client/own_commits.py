@@ -25,32 +25,37 @@ SLOTS_MAX: Final = 512
 
 
 class Unsettled:
-    """The stamps of commits that some shard may not show yet, by shard and slot."""
+    """The stamps of commits that some shard may not show yet.
 
-    __slots__ = ("_all", "_slots")
+    Attributes:
+        by_slot: By shard and slot.
+        by_shard: Of all slots of a shard together, where they are too many.
+    """
+
+    __slots__ = ("by_shard", "by_slot")
 
     def __init__(self) -> None:
-        self._slots: dict[str, dict[Slot, int]] = {}
-        self._all: dict[str, int] = {}
+        self.by_slot: dict[str, dict[Slot, int]] = {}
+        self.by_shard: dict[str, int] = {}
 
     def __bool__(self) -> bool:
-        return bool(self._slots or self._all)
+        return bool(self.by_slot or self.by_shard)
 
     def __len__(self) -> int:
-        return len(self._all) + sum(map(len, self._slots.values()))
+        return len(self.by_shard) + sum(map(len, self.by_slot.values()))
 
     def committed(self, shard: str, slots: Iterable[Slot], stamp_ns: int) -> None:
         """Note a commit.  Threads learn of their commits in any order."""
-        known = self._slots.setdefault(shard, {})
+        known = self.by_slot.setdefault(shard, {})
         for slot in slots:
             known[slot] = max(known.get(slot, 0), stamp_ns)
         if len(known) > SLOTS_MAX:
-            self._all[shard] = self.stamp_ns(shard)
-            del self._slots[shard]
+            self.by_shard[shard] = self.stamp_ns(shard)
+            del self.by_slot[shard]
 
     def shown(self, shard: str, states: Iterable[SlotState], *, until_ns: int = 0) -> None:
         """Note what a shard has shown: as it was at `until_ns`, or as its own stamps say."""
-        known = self._slots.get(shard)
+        known = self.by_slot.get(shard)
         if known is None:
             return
         for state in states:
@@ -58,20 +63,20 @@ class Unsettled:
             if stamp_ns is not None and stamp_ns <= max(until_ns, state.stamp_ns):
                 del known[state.slot]
         if not known:
-            del self._slots[shard]
+            del self.by_slot[shard]
 
     def reached(self, shard: str, stamp_ns: int) -> None:
         """Note that a shard shows all commits up to a stamp, on whatever slot."""
-        known = self._slots.pop(shard, {})
+        known = self.by_slot.pop(shard, {})
         left = {slot: ns for slot, ns in known.items() if ns > stamp_ns}
         if left:
-            self._slots[shard] = left
-        if self._all.get(shard, stamp_ns + 1) <= stamp_ns:
-            del self._all[shard]
+            self.by_slot[shard] = left
+        if self.by_shard.get(shard, stamp_ns + 1) <= stamp_ns:
+            del self.by_shard[shard]
 
     def stamp_ns(self, shard: str, items: Iterable[Item] | None = None) -> int:
         """Return the largest stamp that a shard may not show on these slots (None: any), or 0."""
-        known, newest_ns = self._slots.get(shard, {}), self._all.get(shard, 0)
+        known, newest_ns = self.by_slot.get(shard, {}), self.by_shard.get(shard, 0)
         if items is None:
             return max(newest_ns, *known.values(), 0)
         for item in items if known else ():

@@ -41,7 +41,7 @@ class Phase(enum.Enum):
         self.busy = text in ("acquiring", "viewing", "validating", "committing")
 
 
-OF_SESSIONS: Final = (Welcome, Alive, EpochChanged)
+OF_SESSIONS: Final = frozenset((Welcome, Alive, EpochChanged))
 """The answers that tell something about a session and not only about one lock."""
 
 

@@ -22,7 +22,6 @@ from enact_dist.core.protocol.messages import (
     Alive,
     Answer,
     EpochChanged,
-    Granted,
     Hello,
     KeepAlive,
     KeepVersions,
@@ -64,25 +63,29 @@ L = TypeVar("L", bound=HeldThere)
 class Peer:
     """What this client knows of one shard.
 
-    `acknowledged` is the epoch that a `Hello` has confirmed to the shard; `successions` is how
-    many successions of datum types its newest known catalogue has.
+    `successions` is how many successions of datum types its newest known catalogue has.
     """
 
     epoch: int = 0
-    acknowledged: int = -1
     successions: int = 0
 
 
 class ClientSession(Generic[L]):
-    """The session of one process over all shards, whose locks `core.client.client` begins."""
+    """The session of one process over all shards, whose locks `core.client.client` begins.
+
+    Attributes:
+        greeted: The shards that know that this client is in their epoch.
+        peers: What is known of each shard that was met.
+    """
 
     __slots__ = (
         "_locks",
-        "_peers",
         "_seqs",
         "actor",
+        "greeted",
         "host",
         "observer",
+        "peers",
         "pid",
         "placement",
         "report",
@@ -110,37 +113,46 @@ class ClientSession(Generic[L]):
         self.sendings = Sendings()
         self.seen_stamp_ns = 0
         self.report = b""
-        self._peers: dict[str, Peer] = {}
+        self.peers: dict[str, Peer] = {}
         self._locks: dict[LockId, L] = {}
         self._seqs: dict[int, int] = {}
+        self.greeted: set[str] = set()
         self.unsettled = Unsettled()
 
     # ---------------------------------------------------------------- shards
 
-    def _peer(self, shard: str) -> Peer:
-        peer = self._peers.get(shard)
+    def peer(self, shard: str) -> Peer:
+        """Return what this client knows of a shard."""
+        peer = self.peers.get(shard)
         if peer is None:
-            peer = self._peers[shard] = Peer()
+            peer = self.peers[shard] = Peer()
         return peer
 
     def epoch(self, shard: str) -> int:
         """Return the epoch that the shard was last known in (0: none)."""
-        peer = self._peers.get(shard)
+        peer = self.peers.get(shard)
         return peer.epoch if peer is not None else 0
 
     def successions(self, shard: str) -> int:
         """Return how many successions of datum types are known of the shard's catalogue."""
-        peer = self._peers.get(shard)
+        peer = self.peers.get(shard)
         return peer.successions if peer is not None else 0
 
     def knows_types(self, shard: str, successions: int) -> None:
         """Note how many successions of datum types the newest known catalogue of a shard has."""
-        self._peer(shard).successions = successions
+        self.peer(shard).successions = successions
 
     def needs_hello(self, shard: str) -> bool:
-        """Whether the shard does not know yet that we are in its epoch."""
-        peer = self._peers.get(shard)
-        return peer is None or peer.epoch == 0 or peer.acknowledged != peer.epoch
+        """Whether the shard does not know yet that this client is in its epoch."""
+        return shard not in self.greeted
+
+    def _enters(self, shard: str, epoch: int, *, acknowledged: bool) -> None:
+        """Note the epoch of a shard, and whether a `Hello` has confirmed it there."""
+        self.peer(shard).epoch = epoch
+        if acknowledged and epoch:
+            self.greeted.add(shard)
+        else:
+            self.greeted.discard(shard)
 
     def hello(self, shard: str) -> Hello:
         """Return the greeting, which acknowledges the epoch that we know."""
@@ -165,34 +177,30 @@ class ClientSession(Generic[L]):
         if isinstance(answer, Alive) and isinstance(request, KeepAlive):
             self._alive(shard, request, answer, now_ns)
             return True
-        if self.unsettled and isinstance(answer, Granted):
-            self.unsettled.shown(shard, answer.states)
         return False
 
     def _welcomed(self, shard: str, request: Hello, answer: Welcome) -> None:
-        peer = self._peer(shard)
+        peer = self.peer(shard)
         if answer.epoch < peer.epoch:
             return  # an old answer
         if answer.epoch != peer.epoch:
             self._drop_grants(shard)
-            first = peer.epoch == 0
-            peer.epoch = answer.epoch
             # The first Hello of a session leaves nothing older to be acknowledged, unless the shard
             # restarted before its first answer came through and now waits for us.
-            peer.acknowledged = answer.epoch if first and answer.open else -1
+            first = peer.epoch == 0
+            self._enters(shard, answer.epoch, acknowledged=first and answer.open)
         elif request.known_epoch == answer.epoch:
-            peer.acknowledged = answer.epoch
+            self._enters(shard, answer.epoch, acknowledged=True)
         self.ttl_ns = min(self.ttl_ns, answer.ttl_ns)
         self.learn_placement(answer.placement)
 
     def _epoch_changed(self, shard: str, epoch: int, *, asked_in: int | None) -> None:
-        peer = self._peer(shard)
+        peer = self.peer(shard)
         late = asked_in is not None and asked_in < epoch == peer.epoch
         if epoch < peer.epoch or late:
             return  # whatever was held before is dropped already
         self._drop_grants(shard)
-        peer.epoch = epoch
-        peer.acknowledged = -1
+        self._enters(shard, epoch, acknowledged=False)
 
     def _drop_grants(self, shard: str) -> None:
         for lock in list(self._locks.values()):
@@ -208,8 +216,8 @@ class ClientSession(Generic[L]):
 
         A timestamp that no clock gives is ignored: every shard would refuse any later one.
         """
-        if stamp_ns <= STAMP_NS_MAX:
-            self.seen_stamp_ns = max(self.seen_stamp_ns, stamp_ns)
+        if self.seen_stamp_ns < stamp_ns <= STAMP_NS_MAX:
+            self.seen_stamp_ns = stamp_ns
 
     def committed(self, votes: Mapping[str, Prepared], stamp_ns: int) -> None:
         """Note on which slots the shards that have voted may not show a commit of ours yet."""
@@ -274,7 +282,7 @@ class ClientSession(Generic[L]):
 
         Also while another thread learns of one.
         """
-        return [shard for shard, peer in tuple(self._peers.items()) if peer.epoch]
+        return [shard for shard, peer in tuple(self.peers.items()) if peer.epoch]
 
 
 _GRANTS_COUNT = frozenset((Phase.ACQUIRING, Phase.VIEWING, Phase.HELD))

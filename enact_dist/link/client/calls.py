@@ -96,13 +96,12 @@ _ENTRIES: Final[dict[type, str]] = {
 """The field that pages extend, by type of answer."""
 
 
-def bytes_with(writes: Iterable[Sequence[WriteItem]]) -> int:
-    """Return how many bytes of data the messages for these writes carry."""
+def bytes_with(writes: Iterable[WriteItem]) -> int:
+    """Return how many bytes of data a message with these writes carries."""
     size = 0
-    for each in writes:
-        for _, datum in each:
-            if datum is not None and not datum.file:
-                size += datum.size
+    for _, datum in writes:
+        if datum is not None and not datum.file:
+            size += datum.size
     return size
 
 
@@ -111,7 +110,7 @@ def patience_s(request: Request) -> float:
     if isinstance(request, Acquire):
         return request.wait_ns / 1e9 + CALL_S
     if isinstance(request, _WITH_DATA):
-        return CALL_S + bytes_with([request.writes]) / BYTES_PER_S_MIN
+        return CALL_S + bytes_with(request.writes) / BYTES_PER_S_MIN
     if isinstance(request, _SIGNS_OF_LIFE):
         return CALL_S / 2
     return CALL_S

@@ -117,6 +117,8 @@ class KnownCatalogue:
 
     Attributes:
         lapses: How often a shard had lost an aspect or had it with another type.
+        state: A placement, and the aspects found settled on all its shards; another object after
+            each change of a catalogue.
     """
 
     def __init__(self) -> None:
@@ -126,7 +128,7 @@ class KnownCatalogue:
         self._aspects: dict[str, dict[str, AspectEntry]] = {}
         self._wanted: dict[str, AspectEntry] = {}
         self._worlds: dict[str, dict[str, WorldEntry]] = {}
-        self._settled: tuple[PlacementMap | None, set[AspectEntry]] = (None, set())
+        self.state: tuple[PlacementMap | None, set[AspectEntry]] = (None, set())
 
     def learn(self, shard: str, answer: Welcome | Registered, *, sent_in: int = 0) -> None:
         """Take the catalogue that an answer carries; ignore that of a past epoch.
@@ -149,7 +151,7 @@ class KnownCatalogue:
         self._worlds[shard] = worlds | {entry.name: entry for entry in answer.forks}
         before = self._aspects.get(shard, {})
         now = self._aspects[shard] = {entry.name: entry for entry in answer.aspects}
-        self._settled = (None, set())  # afterwards, so that no thread uses the old state
+        self.state = (None, set())  # afterwards, so that no thread uses the old state
         if not all(
             name in now and same_type(now[name].fingerprint, entry.fingerprint)
             for name, entry in before.items()
@@ -174,7 +176,7 @@ class KnownCatalogue:
     def forget(self, shard: str) -> None:
         """Drop the aspects known of a shard, because its catalogue proved wrong."""
         self._aspects.pop(shard, None)
-        self._settled = (None, set())
+        self.state = (None, set())
         self.lapses += 1
 
     def settled(self, aspects: Iterable[AspectEntry], placement: PlacementMap) -> bool:
@@ -182,10 +184,10 @@ class KnownCatalogue:
 
         The result is cached until a catalogue changes, because every lock asks.
         """
-        settled_for, settled = self._settled
+        settled_for, settled = self.state
         if placement is not settled_for:
             settled = set()
-            self._settled = (placement, settled)
+            self.state = (placement, settled)
         for entry in aspects:
             if entry not in settled:
                 if any(self.lacks(shard.name, (), (entry,)) for shard in placement.shards):

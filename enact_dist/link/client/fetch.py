@@ -60,6 +60,10 @@ class DatumCache:
     def __contains__(self, slot: Slot) -> bool:
         return slot in self._known
 
+    def holds_none(self, slots: Iterable[Slot]) -> bool:
+        """Whether no datum of these slots is here."""
+        return self._known.keys().isdisjoint(slots)
+
     def version(self, slot: Slot, shard: str, epoch: int) -> int:
         """Return the known version of a slot in this epoch (0: none)."""
         with self._mutex:

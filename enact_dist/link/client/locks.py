@@ -34,7 +34,7 @@ from enact_dist.core.protocol.messages import (
 )
 from enact_dist.core.shard.on_lock import NEWER_TYPE
 from enact_dist.errors import CommitUnknownError, EnactError, MisuseError
-from enact_dist.link.client.calls import BYTES_PER_S_MIN, CALL_S, bytes_with
+from enact_dist.link.client.calls import BYTES_PER_S_MIN, CALL_S, bytes_with, patience_s
 from enact_dist.link.client.lanes import name_of, read_name
 from enact_dist.link.client.session import (
     CALLS_S_MAX,
@@ -96,39 +96,34 @@ class CellClient(SessionClient):
             MisuseError: Too many threads hold or await locks.
             EnactError: The shard refused the request.
         """
-        self.check_usable()
+        if self.forked or self.closed:
+            self.check_usable()
         items, begun = tuple(items), [] if begun is None else begun
-        started_ns = self._now_ns()
+        core, started_ns = self.core, self._now_ns()
         give_up_ns = started_ns + int(min(wait_s, CALLS_S_MAX) * 1e9)
-
-        def begin(*, lock_views: bool = False) -> None:
-            with self._mutex:
-                plan = self.core.plan(items, lock_views=lock_views, past_ns=past_ns)
-                now_ns = self._now_ns()
-                wait_ns, hold_ns = max(0, give_up_ns - now_ns), int(hold_s * 1e9)
-                lock = self.core.begin(lane, plan, now_ns=now_ns, wait_ns=wait_ns, hold_ns=hold_ns)
-                begun.append(lock)
-                for before in begun[-2:-1]:
-                    before.lane_free = True  # the next lock takes over the lane
-            if interrupt is not None:
-                lock.slice_ns = INTERRUPTIBLE_SLICE_NS
-
         self.renewal.used()
-        lane = self._lanes.take()
+        lane, lock_views = self._lanes.take(), False
         try:
-            begin()
             for attempt in itertools.count():
-                lock = begun[-1]
+                with self._mutex:
+                    plan = core.plan(items, lock_views=lock_views, past_ns=past_ns)
+                    now_ns = self._now_ns()
+                    wait_ns, hold_ns = max(0, give_up_ns - now_ns), int(hold_s * 1e9)
+                    lock = core.begin(lane, plan, now_ns=now_ns, wait_ns=wait_ns, hold_ns=hold_ns)
+                    begun.append(lock)
+                    for before in begun[-2:-1]:
+                        before.lane_free = True  # the next lock takes over the lane
+                if interrupt is not None:
+                    lock.slice_ns = INTERRUPTIBLE_SLICE_NS
                 self._drive(lock, interrupt=interrupt)
                 if lock.phase is Phase.HELD:
                     return lock
                 over = attempt > 0 and self._now_ns() >= give_up_ns
                 if over or not self._begins_anew(lock, attempt):
                     break
-                lock_views = lock.no_cut and not self.core.observer and not past_ns
+                lock_views = lock.no_cut and not core.observer and not past_ns
                 if lock_views:
                     self.count("views_locked")
-                begin(lock_views=lock_views)
             waited_s = (self._now_ns() - started_ns) / 1e9
             raise not_granted(lock, waited_s, self.carrier.endpoint_of, items)
         except BaseException:
@@ -165,8 +160,8 @@ class CellClient(SessionClient):
         # A shard without a folder has restarted: its catalogue is empty again.
         named = {i.aspect for _, its in (*lock.plan.locks, *lock.plan.views) for i in its}
         for shard in shards:
-            self._catalogue.forget(shard)
-        aspects = self._catalogue.wanted(named)
+            self.catalogue.forget(shard)
+        aspects = self.catalogue.wanted(named)
         self.register(aspects=aspects, needed=lambda: shards)
         return bool(aspects)
 
@@ -194,13 +189,18 @@ class CellClient(SessionClient):
                     self._wait_until(lock, wait_until_ns, returns, interrupt)
                     continue
                 returns = self.pauses.returns
-                if lock.phase is not Phase.ACQUIRING:
+                if lock.unnamed and not self.carrier.inside:
                     calls = [(shard, self._sendable(shard, request)) for shard, request in calls]
-                answers = self._send(calls)
+                if len(calls) == 1 and not self._further.doubted:
+                    shard, request = calls[0]
+                    timeout_s = patience_s(request)
+                    answers = [self.carrier.request(shard, request, timeout_s=timeout_s)]
+                else:
+                    answers = self._send(calls)
                 with self._mutex:
                     for (shard, request), answer in zip(calls, answers, strict=True):
-                        if isinstance(answer, LEARNT):
-                            self._learn(shard, answer)
+                        if type(answer) in LEARNT:
+                            self._learn(shard, answer)  # type: ignore[arg-type]  # one of these
                         lock.answered(shard, request, answer, self._now_ns())
                 if self.core.placement is not self._further.linked:
                     self._further.follow(self.core.placement)
@@ -228,9 +228,7 @@ class CellClient(SessionClient):
 
     def _sendable(self, shard: str, request: Request) -> Request:
         """Return a request ready to send, staging again any data that a shard has lost."""
-        if not isinstance(request, _WITH_DATA) or self.carrier.inside:
-            return request
-        if bytes_with([request.writes]) <= COMMIT_BYTES_MAX:
+        if not isinstance(request, _WITH_DATA) or bytes_with(request.writes) <= COMMIT_BYTES_MAX:
             return request
         named = stage(self, {shard: request.writes}, self.check_usable)
         return replace(request, writes=tuple(named[shard]))
@@ -272,14 +270,15 @@ class CellClient(SessionClient):
         named, size = writes, 0
         try:
             if writes and lock.phase is Phase.HELD:
-                self._check_open(lock)
-                size = bytes_with(writes.values())
+                size = sum(map(bytes_with, writes.values()))
                 if size > INLINE_BYTES_MAX:
-                    named = stage(self, writes, lambda: self._check_held(lock))
-                    started_ns, size = self._now_ns(), bytes_with(named.values())
-            with self._mutex:
-                if lock.phase is Phase.HELD:
                     self._check_open(lock)
+                    named = stage(self, writes, lambda: self._check_held(lock))
+                    started_ns, size = self._now_ns(), sum(map(bytes_with, named.values()))
+            with self._mutex:
+                if self.forked or self.closed:
+                    self._check_open(lock)
+                if lock.phase is Phase.HELD:
                     finish_s = FINISH_S + size / BYTES_PER_S_MIN
                     give_up_ns = started_ns + int(finish_s * 1e9)
                     lock.finish(
@@ -360,8 +359,9 @@ class CellClient(SessionClient):
         if lock.lane_free:
             return
         try:
-            with self._mutex:
-                lock.release()
+            if lock.phase.busy or lock.phase is Phase.HELD:
+                with self._mutex:
+                    lock.release()
             if lock.farewells:
                 self._say_farewell(lock)
         finally:

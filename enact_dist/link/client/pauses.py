@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import random
 import threading
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
 from enact_dist.core.client.backoff import SignsOfLife
 
@@ -18,6 +18,10 @@ if TYPE_CHECKING:
 
     from enact_dist.core.client.client import Client
     from enact_dist.link.carrier import Carrier
+
+
+USED_AGAIN_NS: Final = 50_000_000
+"""How long one note that a session is used holds: less than the shortest TTL."""
 
 
 class Pauses:
@@ -125,6 +129,7 @@ class Renewal:
         self._pauses, self._now_ns = pauses, now_ns
         self._signs = SignsOfLife(random.random)
         self._rests_long = False
+        self._used_ns = -USED_AGAIN_NS
 
     def pause_s(self) -> float:
         """Return how long until the next keep-alive is due."""
@@ -145,8 +150,12 @@ class Renewal:
 
     def used(self) -> None:
         """Note that a lock begins, or that a thread waits for news from the shards."""
+        now_ns = self._now_ns()
+        if now_ns < self._used_ns + USED_AGAIN_NS:
+            return  # noted already, and the keep-alive thread rests long only a TTL later
         with self._mutex:
-            self._signs.used(self._now_ns(), self._core.ttl_ns)
+            self._used_ns = now_ns
+            self._signs.used(now_ns, self._core.ttl_ns)
             hurry, self._rests_long = self._rests_long, False
         if hurry:
             self._pauses.hurry()

@@ -18,8 +18,13 @@ import threading
 import weakref
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.client.backoff import CALLED_NS_MAX, CALLED_NS_MIN, Backoff
-from enact_dist.core.client.lock import RETRY_NS_MAX, RETRY_NS_MIN
+from enact_dist.core.client.backoff import (
+    CALLED_NS_MAX,
+    CALLED_NS_MIN,
+    RETRY_NS_MAX,
+    RETRY_NS_MIN,
+    Backoff,
+)
 from enact_dist.core.protocol.messages import (
     Alive,
     Answer,
@@ -57,7 +62,7 @@ FINISH_S: Final = 10.0
 """Default time for repeating a call before its shard counts as unreachable."""
 # Tuples: a union would be rebuilt for each call.
 _GREETINGS: Final = (Welcome, Alive)
-LEARNT: Final = (*CATALOGUES, Alive)
+LEARNT: Final = frozenset((*CATALOGUES, Alive))
 """The answers from which a session learns something about a shard."""
 
 CALLS_S_MAX: Final = 1e8
@@ -81,6 +86,7 @@ class SessionClient:
 
     Attributes:
         patience_s: How long a call is repeated by default.
+        catalogue: What is known of the shards' catalogues.
     """
 
     def __init__(
@@ -105,7 +111,7 @@ class SessionClient:
         self.pauses = Pauses()
         self.renewal = Renewal(client, carrier, self._mutex, self.pauses, now_ns)
         self._lanes = Lanes()
-        self._catalogue = KnownCatalogue()
+        self.catalogue = KnownCatalogue()
         self.payloads = SharedPayloads(
             client.session,
             weakly(self._staged),
@@ -321,8 +327,8 @@ class SessionClient:
 
     def _learn(self, shard: str, answer: Answer, sent_in: int = 0) -> None:
         if isinstance(answer, CATALOGUES):
-            self._catalogue.learn(shard, answer, sent_in=sent_in)
-            self.core.knows_types(shard, self._catalogue.successions(shard))
+            self.catalogue.learn(shard, answer, sent_in=sent_in)
+            self.core.knows_types(shard, self.catalogue.successions(shard))
         if isinstance(answer, _GREETINGS):
             if isinstance(answer, Welcome):
                 self.payloads.learn(answer)
@@ -358,30 +364,25 @@ class SessionClient:
 
     def worlds(self) -> dict[str, WorldEntry]:
         """Return the world contexts that every greeted shard knows."""
-        return self._catalogue.worlds()
+        return self.catalogue.worlds()
 
     def worlds_at(self, name: str) -> dict[str, WorldEntry]:
         """Return the greeted shards that know a world context, each with its entry."""
-        return self._catalogue.worlds_at(name)
+        return self.catalogue.worlds_at(name)
 
     def aspect_entries(self) -> dict[str, AspectEntry]:
         """Return the registered aspects of all greeted shards by name."""
-        return self._catalogue.aspects()
-
-    @property
-    def lapses(self) -> int:
-        """How often a shard had lost an aspect or had it with another type."""
-        return self._catalogue.lapses
+        return self.catalogue.aspects()
 
     def knows(self, aspects: Sequence[AspectEntry]) -> bool:
         """Whether every shard of the cell is known to have these aspects: the usual case."""
-        return self._catalogue.settled(aspects, self.core.placement)
+        return self.catalogue.settled(aspects, self.core.placement)
 
     def lacking(
         self, aspects: Sequence[AspectEntry], needed: Callable[[], Iterable[str]]
     ) -> list[str]:
         """Return those of the needed shards that may lack some of these aspects."""
-        missing = [shard for shard in self.shards() if self._catalogue.lacks(shard, (), aspects)]
+        missing = [shard for shard in self.shards() if self.catalogue.lacks(shard, (), aspects)]
         if not missing:
             return []
         wanted = set(needed())
@@ -415,10 +416,8 @@ class SessionClient:
                 "this session only observes: it cannot lock or create world contexts and"
                 " aspects; connect without observer=True"
             )
-        self._catalogue.wants(aspects)
-        missing = [
-            shard for shard in self.shards() if self._catalogue.lacks(shard, worlds, aspects)
-        ]
+        self.catalogue.wants(aspects)
+        missing = [shard for shard in self.shards() if self.catalogue.lacks(shard, worlds, aspects)]
         if missing and needed is not None:
             wanted = set(needed())
             missing = [shard for shard in missing if shard in wanted]

@@ -25,7 +25,7 @@ from enact_dist.link.carrier import check_usable
 from enact_dist.link.notices import NoticeQueue
 from enact_dist.link.socket.feed import SocketFeed
 from enact_dist.link.socket.frames import greeting_of
-from enact_dist.link.socket.line import Connection, SocketLine
+from enact_dist.link.socket.line import IDLE_MAX, Connection, SocketLine
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -174,7 +174,10 @@ class SocketCarrier:
     @staticmethod
     def _sent(line: SocketLine, message: Request, timeout_s: float) -> Connection | None:
         """Send a request over a socket; None if none of it can have arrived."""
-        connection = line.take()
+        try:
+            connection: Connection | None = line.idle.pop()
+        except IndexError:
+            connection = line.connect()
         if connection is None:
             return None
         try:
@@ -381,7 +384,9 @@ def _received(
     except BaseException:  # an interrupt, too
         line.drop(connection)
         raise
-    line.give_back(connection)
+    line.idle.append(connection)
+    if line.closed or len(line.idle) > IDLE_MAX:
+        line.settle(connection)
     return answer
 
 

@@ -212,6 +212,10 @@ class Stream:
             return self._receive_long(kind, header_bytes, payload_bytes, filled, into)
         while filled < length:
             filled += self._more(view[filled:])
+        if filled == length:  # usually: a peer waits for its answer
+            self._filled = 0
+            end = PREFIX_BYTES + header_bytes
+            return kind, bytes(view[PREFIX_BYTES:end]), bytes(view[end:length])
         return self._taken(kind, header_bytes, length, filled)
 
     def receive_here(self, *, wait: bool = False) -> tuple[int, bytes, Buffer] | None:

@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.messages import Answer, Notice
 from enact_dist.errors import EnactError, LinkError, ProtocolError
-from enact_dist.link.carrier import read_answer
 from enact_dist.link.memory.shared_folder import open_shared
 from enact_dist.link.notices import Skipped
 from enact_dist.link.socket.frames import (
@@ -32,7 +31,7 @@ from enact_dist.link.socket.frames import (
     wait_at_most,
 )
 from enact_dist.link.socket.peers import check_peer
-from enact_dist.wire.frames import decode_frame, encode_parts
+from enact_dist.wire.frames import decode_answer, decode_frame, encode_parts
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -110,7 +109,7 @@ class Connection:
                 f"shard {self.shard} sent a frame of kind {kind} instead of an answer"
                 f" ({header.decode('utf-8', 'replace')})"
             )
-        return read_answer(self.shard, header, payload)
+        return decode_answer(self.shard, header, payload)
 
     def exchange(self, kind: Kind, header: bytes) -> None:
         """Send a frame and wait for the shard's acceptance.
@@ -181,6 +180,8 @@ class SocketLine:
     Attributes:
         name: As given.
         problem: Why the last attempt to connect failed; empty without a failure.
+        idle: The connections that wait for a call; any thread may take one from the end.
+        closed: Whether it has ended.
     """
 
     def __init__(
@@ -197,30 +198,37 @@ class SocketLine:
         self._nonce = nonce
         self._greeting = greeting
         self._away = away
-        self._idle: list[Connection] = []
+        self.idle: list[Connection] = []
         # Weak: Ctrl-C may hit the holder between any two steps, which abandons the connection.
         self._open: weakref.WeakSet[Connection] = weakref.WeakSet()
         self._mutex = threading.Lock()
         self._retry_at_s = 0.0
         self._retry_s = RETRY_S_MIN
-        self._closed = False
+        self.closed = False
 
     def take(self) -> Connection | None:
         """Return a connection for one call; None if none is available."""
         try:
-            return self._idle.pop()
+            return self.idle.pop()
         except IndexError:
             return self.connect()
 
     def give_back(self, connection: Connection) -> None:
         """Keep the connection of an answered call for the next one."""
-        kept = len(self._idle) < IDLE_MAX
-        if kept:
-            self._idle.append(connection)
-        if self._closed:  # perhaps just closed by another thread
-            self.lost(connection)
-        elif not kept:
-            self.drop(connection)
+        self.idle.append(connection)
+        if self.closed or len(self.idle) > IDLE_MAX:
+            self.settle(connection)
+
+    def settle(self, given: Connection) -> None:
+        """Close what is not kept, after `given` has become idle."""
+        if self.closed:  # perhaps just closed by another thread, which has not seen this one
+            self.lost(given)
+            return
+        try:
+            surplus = self.idle.pop()
+        except IndexError:  # other calls have taken them
+            return
+        self.drop(surplus)
 
     def drop(self, connection: Connection) -> None:
         """Close a connection whose answer was late or invalid."""
@@ -232,7 +240,7 @@ class SocketLine:
         """Note that a connection has broken: the others are suspect, too."""
         self.drop(connection)
         with self._mutex:
-            idle, self._idle = self._idle, []
+            idle, self.idle = self.idle, []
         for other in idle:
             self.drop(other)
 
@@ -256,14 +264,14 @@ class SocketLine:
         self.problem, self._retry_s = "", RETRY_S_MIN
         with self._mutex:
             self._open.add(connection)
-        if self._closed:  # closed meanwhile by another thread
+        if self.closed:  # closed meanwhile by another thread
             self.drop(connection)
             return None
         return connection
 
     def _may_connect(self) -> bool:
         rests = time.monotonic() < self._retry_at_s
-        return not self._closed and not rests and len(self._open) < CONNECTIONS_MAX
+        return not self.closed and not rests and len(self._open) < CONNECTIONS_MAX
 
     def _connected(self) -> Connection:
         folder = open_shared(self.name, self._nonce)
@@ -289,15 +297,15 @@ class SocketLine:
 
     def abandon(self) -> None:
         """Close the connections that a forked child has inherited; sends the shard nothing."""
-        self._closed = True
+        self.closed = True
         for connection in (*self._open,):
             connection.socket.close()
 
     def close(self) -> None:
         """End all connections; pending calls return without an answer."""
         with self._mutex:
-            self._closed = True
-            idle, self._idle = self._idle, []
+            self.closed = True
+            idle, self.idle = self.idle, []
             left = [connection for connection in self._open if connection not in idle]
             self._open.difference_update(idle)
         for connection in idle:

@@ -32,7 +32,7 @@ import zenoh
 
 from enact_dist.core.protocol.messages import Answer, Commit, Notice, Ping, Prepare
 from enact_dist.errors import ProtocolError, ShardUnreachableError
-from enact_dist.link.carrier import check_usable, failure_of, read_answer
+from enact_dist.link.carrier import check_usable, failure_of
 from enact_dist.link.notices import NoticeQueue
 from enact_dist.link.zenoh.bulk import BulkWay
 from enact_dist.link.zenoh.config import (
@@ -43,7 +43,7 @@ from enact_dist.link.zenoh.config import (
     open_session,
 )
 from enact_dist.link.zenoh.presence import Inside, ShardPresence
-from enact_dist.wire.frames import decode_frame, encode_frame
+from enact_dist.wire.frames import decode_answer, decode_frame, encode_frame
 from enact_dist.wire.keys import notice_key, request_key, token_key, verb_of
 
 if TYPE_CHECKING:
@@ -485,7 +485,7 @@ def answer_in(sample: zenoh.Sample, shard: str) -> Answer:
     Raises:
         ProtocolError: It cannot be read or is no answer.
     """
-    return read_answer(shard, _bytes(sample.attachment), _bytes(sample.payload))
+    return decode_answer(shard, _bytes(sample.attachment), _bytes(sample.payload))
 
 
 def wait_connected(session: zenoh.Session, wait_s: float) -> bool:
