@@ -40,8 +40,7 @@ if TYPE_CHECKING:
     from enact_dist.wire.codecs import register_codec
     from enact_dist.world.cell import Cell
     from enact_dist.world.connecting import connect, local
-    from enact_dist.world.context import WorldContext
-    from enact_dist.world.history import Version
+    from enact_dist.world.context import Version, WorldContext
     from enact_dist.world.past import PastContext
 
 __all__ = [
@@ -88,7 +87,7 @@ _HOME_OF = {
     "Snapshot": "access.snapshot",
     "Together": "access.together",
     "Tolerance": "comparing",
-    "Version": "world.history",
+    "Version": "world.context",
     "Watch": "access.watch",
     "WorldContext": "world.context",
     "connect": "world.connecting",

@@ -220,7 +220,7 @@ def _pending(actor: Actor, bound: BoundActor) -> PendingTriggers:
     )
     assert isinstance(pending, PendingTriggers)
     for watched in bound.watched():
-        found = watched.context.survey(str(watched.entities), tuple(watched.triggers))
+        found = watched.context.list_slots(str(watched.entities), tuple(watched.triggers))
         for slot in found:
             if not bound.covers(slot.entity):
                 continue

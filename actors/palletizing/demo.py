@@ -210,9 +210,9 @@ def _look(cell: Cell) -> _Seen:
     orders = training.view(scans)[scans]
     return _Seen(
         notices=online.view(notices).get(notices, {}),
-        models={slot.entity.name for slot in training.survey(PRODUCTS, ("surface",))},
+        models={slot.entity.name for slot in training.list_slots(PRODUCTS, ("surface",))},
         models_ordered=len(orders),
-        views=len(training.survey(VIEWS, ("surface",))),
+        views=len(training.list_slots(VIEWS, ("surface",))),
         views_ordered=sum(orders.values()),
     )
 

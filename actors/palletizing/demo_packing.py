@@ -246,8 +246,8 @@ def _training(cell: Cell) -> tuple[int, int, set[str]]:
     """Return how many views there are, how many are ordered, and which products are trained."""
     training = cell.world("training")
     scans = ViewEach(training, PRODUCTS, SCAN)
-    models = {slot.entity.name for slot in training.survey(PRODUCTS, ("surface",))}
-    views = len(training.survey(VIEWS, ("surface",)))
+    models = {slot.entity.name for slot in training.list_slots(PRODUCTS, ("surface",))}
+    views = len(training.list_slots(VIEWS, ("surface",)))
     return views, sum(training.view(scans)[scans].values()), models
 
 
@@ -257,7 +257,7 @@ def _online(cell: Cell, running: RobotCell | RunningRobotCell, seen: Seen) -> di
     flags, results = View(online, SYSTEM, DEVIATIONS), View(online, SYSTEM, RESULTS)
     notices, plans = View(online, USER, NOTICES), ViewEach(training, PLACES, PLAN)
     now = online.view(flags, results, notices)
-    if not seen.started_s and online.survey("package/*", ("sighting",)):
+    if not seen.started_s and online.list_slots("package/*", ("sighting",)):
         seen.started_s = time.monotonic()
     found, planned = now.get(flags, {}), training.view(plans)[plans]
     new = [

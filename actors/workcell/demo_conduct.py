@@ -157,7 +157,7 @@ class Conductor:
 
     def _with(self, aspect: str) -> set[str]:
         """Return the cameras that have an aspect."""
-        return {slot.entity.name for slot in self._online.survey(words.CAMERAS, (aspect,))}
+        return {slot.entity.name for slot in self._online.list_slots(words.CAMERAS, (aspect,))}
 
     def _stale(self) -> list[str]:
         """Return which stages have no fresh datum."""
@@ -312,11 +312,11 @@ class Conductor:
 
     def _label(self, label: str, tree: CauseTree, images: Sequence[Version[Image]] = ()) -> None:
         """Keep all versions of a tree under a label, in place of what it kept before."""
-        if label in self._cell.kept():
-            self._cell.let_go(label)
+        if label in self._cell.pinned():
+            self._cell.unpin(label)
         known = [cause for cause in tree.walk() if cause.known]
         with contextlib.suppress(ForgottenError):  # images go first; all else is kept
-            self._cell.keep(label, (*known, *images))
+            self._cell.pin(label, (*known, *images))
 
     def _say(self, now_s: float, text: str) -> None:
         line = f"{now_s:6.1f} s  {text}"

@@ -114,7 +114,7 @@ def show_past(cell: Cell, notes: Notes, console: Console) -> None:
         )
     masks = [
         version
-        for version in cell.kept().get("nearest", ())
+        for version in cell.pinned().get("nearest", ())
         if version.aspect.name == words.SILHOUETTE.name and version.stamp_ns == notes.nearest_ns
     ]
     console.print(f"{len(masks)} masks of that stamp, kept under the label nearest")

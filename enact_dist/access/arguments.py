@@ -1,13 +1,11 @@
 """Checks of arguments: a call refuses a wrong argument at once, by its name.
 
-Entities, aspects and names differ only by their types: a call with an aspect in place of an entity
+Entities, aspects and names differ only by their types: a call with an aspect instead of an entity
 would look for an entity of that name and find none.
 
-Moments of the past: their text forms and timestamps.
-
-Time is that of the shards' commits, a hybrid logical clock in nanoseconds since 1970.  What a
-`Position` says is exact; a `datetime` or a number of seconds is a reading of some wall clock, which
-the shards' clocks follow.
+A moment is a timestamp of the shards' commits: of a hybrid logical clock, in nanoseconds since
+1970.  A `Position` is exact; a `datetime` or a number of seconds is a reading of some wall clock,
+which the shards' clocks follow.
 """
 
 from __future__ import annotations
@@ -21,12 +19,12 @@ from typing import Any, Final, NamedTuple, TypeVar
 
 from enact_dist.core.protocol.datum import Position
 from enact_dist.errors import MisuseError
-from enact_dist.terms import Aspect, Context, Entities, Entity, wrong_argument
+from enact_dist.terms import Aspect, Context, Entities, Entity, checked_name, wrong_argument
 from enact_dist.wire.limits import REASON_CHARACTERS_MAX
 from enact_dist.wire.texts import is_safe, shown
 
 When = Position | datetime | float
-"""A moment: where a commit stands, an aware `datetime`, or seconds since 1970."""
+"""A moment: the position of a commit, an aware `datetime`, or seconds since 1970."""
 
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 _STAMP_NS_MAX: Final = (1 << 63) - 1
@@ -36,9 +34,9 @@ class Moment(NamedTuple):
     """What a `PastContext` shows.
 
     Attributes:
-        at_ns: All commits stamped up to this; 0 where data are asked by when they were captured.
-        captured_ns: The capture stamp of the data, 0 where it does not matter.
-        nearest: Whether one captured at another time will do, the nearest.
+        at_ns: The timestamp up to which commits are shown; 0: data are chosen by capture stamp.
+        captured_ns: The capture stamp of the data; 0: it does not matter.
+        nearest: Whether the datum with the nearest capture stamp is taken if none matches.
     """
 
     at_ns: int
@@ -58,21 +56,21 @@ def stamp_of(when: When, *, seen_ns: int = 0) -> int:
     """
     if isinstance(when, Position):
         stamp_ns = when.stamp_ns
-        latest_ns = stamp_ns  # of a commit that there is; its shard knows better
+        latest_ns = stamp_ns  # the commit exists, so it is not in the future
     else:
         stamp_ns = _wall_ns(when)
         latest_ns = max(seen_ns, time.time_ns())
     if stamp_ns <= 0:
         raise MisuseError(
-            f"{_shown(when)} lies before 1970, when nothing was known; so long ago is"
+            f"{_shown(when)} lies before 1970, when nothing was known; 30 seconds ago is"
             " time.time() - 30, on a command line -30s"
         )
     if stamp_ns > latest_ns or stamp_ns > _STAMP_NS_MAX:
         ahead_s = (stamp_ns - latest_ns) // 1_000_000 / 1000 if stamp_ns <= _STAMP_NS_MAX else 0.0
         far = f"{ahead_s:.3g} s" if ahead_s else "centuries"
         raise MisuseError(
-            f"{_shown(when)} lies {far} in the future, of which nothing is known; a moment is"
-            " given in seconds since 1970, as an aware datetime or as the Position of a commit"
+            f"{_shown(when)} lies {far} in the future, which is unknown; give a moment in seconds"
+            " since 1970, as an aware datetime or as the Position of a commit"
         )
     return stamp_ns
 
@@ -98,6 +96,14 @@ def _wall_ns(when: datetime | float) -> int:
 
 
 T = TypeVar("T")
+
+
+def checked_as(kind: str, name: str, *, slashes: bool = False) -> str:
+    """Return `name` if it may name a `kind`; else raise `MisuseError` with what is wrong."""
+    try:
+        return checked_name(kind, name, slashes=slashes)
+    except ValueError as error:
+        raise MisuseError(str(error)) from None
 
 
 def check_argument(call: str, name: str, found: object, *wanted: type[Any]) -> None:

@@ -1,50 +1,131 @@
-"""What several parts of the API ask shards: about versions, and for their present."""
+"""Questions to the shards of a cell: the same to all of them, about versions, about the present."""
 
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from enact_dist.core.protocol.messages import AwaitStamp, Reached, Refused, Versions
+from enact_dist.core.protocol.messages import (
+    AwaitStamp,
+    Explain,
+    ListHistory,
+    Reached,
+    Refused,
+    Versions,
+)
 from enact_dist.errors import ProtocolError
 from enact_dist.link.refusals import error_of
 
 if TYPE_CHECKING:
-    from enact_dist.core.protocol.messages import Answer
+    from collections.abc import Iterable, Iterator, Sequence
+
+    from enact_dist.core.protocol.datum import Slot
+    from enact_dist.core.protocol.messages import Answer, Request, SlotVersion, VersionEntry
     from enact_dist.link.client.locks import CellClient
 
+A = TypeVar("A")
+Part = TypeVar("Part")
+
 EARLY_PAUSE_S: Final = 0.02
-"""Pause before a question is asked again that a shard has answered before its time."""
+"""Pause before a question is repeated that a shard has answered before its time."""
+ASKED_MAX: Final = 256
+"""Most versions that one question names; the cause of each may name a thousand others."""
 
 
-def versions_in(answer: Answer) -> Versions:
-    """Return an answer that is to list versions.
+def expected(kind: type[A], asked: type[Any], answer: Answer) -> A:
+    """Return an answer that must be of one kind.
+
+    Args:
+        kind: The kind.
+        asked: The type of the request, for the message.
+        answer: What the shard answered.
 
     Raises:
         EnactError: The error of a refusal.
-        ProtocolError: It is something else.
+        ProtocolError: The answer is of another kind.
     """
+    if isinstance(answer, kind):
+        return answer
     if isinstance(answer, Refused):
         raise error_of(answer)
-    if not isinstance(answer, Versions):
-        raise ProtocolError(f"{type(answer).__name__} came where versions were asked for")
-    return answer
+    raise ProtocolError(f"{type(answer).__name__} came as the answer to {asked.__name__}")
+
+
+def answers_to(
+    client: CellClient, kind: type[A], calls: Sequence[tuple[str, Request]]
+) -> list[tuple[str, A]]:
+    """Make calls at once; return the shard and the answer of each, all of one kind.
+
+    Raises:
+        ShardUnreachableError: A shard does not answer.
+        EnactError: A shard refuses a call.
+    """
+    answers = zip(calls, client.call_all(calls), strict=True)
+    return [(shard, expected(kind, type(request), found)) for (shard, request), found in answers]
+
+
+def ask_all(
+    client: CellClient, kind: type[A], request: Request, shards: Iterable[str] | None = None
+) -> list[tuple[str, A]]:
+    """Send one question to some shards (None: all), as `answers_to` does; listings are complete."""
+    shards = client.shards() if shards is None else shards
+    return answers_to(client, kind, [(shard, request) for shard in shards])
+
+
+def in_parts(several: Sequence[Part], most: int = ASKED_MAX) -> Iterator[tuple[Part, ...]]:
+    """Yield a sequence in parts of at most so many."""
+    for start in range(0, len(several), most):
+        yield tuple(several[start : start + most])
+
+
+def explained(client: CellClient, versions: Iterable[SlotVersion]) -> list[Versions]:
+    """Ask who made these versions, and of what; versions that their shard forgot are left out.
+
+    Raises:
+        ShardUnreachableError: A shard does not answer.
+    """
+    by_shard: dict[str, list[SlotVersion]] = {}
+    for version in versions:
+        by_shard.setdefault(client.shard_of(version.slot.entity), []).append(version)
+    calls = [
+        (shard, Explain(some)) for shard, asked in by_shard.items() for some in in_parts(asked)
+    ]
+    return [answer for _, answer in answers_to(client, Versions, calls)]
+
+
+def listed(
+    client: CellClient, shard: str, slot: Slot, *, since_ns: int = 0, count: int = 0
+) -> tuple[VersionEntry, ...]:
+    """Return what a shard knows of one slot's versions, oldest first.
+
+    Args:
+        client: The client that asks.
+        shard: The shard that stores the slot.
+        slot: The slot.
+        since_ns: Only versions that were current after this stamp.
+        count: At most this many, the newest ones (0: all).
+
+    Raises:
+        ShardUnreachableError: The shard does not answer.
+    """
+    request = ListHistory((slot.context,), (slot.entity,), (slot.aspect,), since_ns, count)
+    return expected(Versions, ListHistory, client.call(shard, request)).entries
 
 
 def await_stamp(
     client: CellClient, shard: str, stamp_ns: int, *, wait_s: float, timeout_s: float | None = None
 ) -> bool:
-    """Wait until a shard shows every commit up to a stamp, one slice at most; say whether it does.
+    """Wait until a shard shows every commit up to a stamp; say whether it does.
 
     Args:
         client: The client that asks.
-        shard: Whom it asks.
-        stamp_ns: Up to which stamp.
-        wait_s: How long the shard may wait for it.
-        timeout_s: How long the shard may stay without an answer (None: `patience_s`).
+        shard: The shard that is asked.
+        stamp_ns: The stamp to wait for.
+        wait_s: How long the shard may wait for it, at most one slice.
+        timeout_s: How long to wait for an answer of the shard (None: `patience_s`).
 
     Raises:
-        ShardUnreachableError: It does.
+        ShardUnreachableError: The shard does not answer.
     """
     core, wait_ns, begin_s = client.core, int(wait_s * 1e9), time.monotonic()
     answers = client.ask_each(
@@ -57,7 +138,7 @@ def await_stamp(
         raise client.unreachable(shard, time.monotonic() - begin_s)
     reached = isinstance(answer, Reached) and answer.reached
     if not reached and time.monotonic() - begin_s < wait_s / 2:
-        client.rest(EARLY_PAUSE_S)  # too many of this process wait, or the shard ends
+        client.rest(EARLY_PAUSE_S)  # too many questions of this process wait, or the shard ends
     return reached
 
 
@@ -67,6 +148,5 @@ def present_ns(client: CellClient) -> int:
     Raises:
         ShardUnreachableError: A shard does not answer.
     """
-    answers = client.call_all([(shard, AwaitStamp(0, 0)) for shard in client.shards()])
-    stamps_ns = [answer.stamp_ns for answer in answers if isinstance(answer, Reached)]
-    return max(client.core.seen_stamp_ns, *stamps_ns)
+    answers = ask_all(client, Reached, AwaitStamp(0, 0))
+    return max(client.core.seen_stamp_ns, *(answer.stamp_ns for _, answer in answers))

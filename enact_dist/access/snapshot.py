@@ -1,24 +1,34 @@
-"""A view without a lock: taken over all shards as one cut, then read like a lock's data."""
+"""Views without a lock: a consistent snapshot over all shards, read like the data of a lock.
+
+A `Snapshot` has its data from the start; those of a `HeldView` are fetched on demand.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, TypeVar, overload
 
 from enact_dist.access.arguments import Moment, check_argument
+from enact_dist.access.asking import ask_all
+from enact_dist.access.closing import Closing
 from enact_dist.access.reads import EachData, Readings, check_requested, slot_of
 from enact_dist.access.session import session_of, unknown_aspect
 from enact_dist.access.together import Together, captured_versions
+from enact_dist.core.protocol.datum import Position
 from enact_dist.core.protocol.messages import Survey, Surveyed
-from enact_dist.errors import LeaseLostError, MisuseError, NullDatumError, ProtocolError
+from enact_dist.errors import LeaseLostError, MisuseError, NullDatumError
+from enact_dist.link.client.fetch import fetch_all
 from enact_dist.terms import Aspect, Entity, NullReason, View
 from enact_dist.wire.limits import ITEMS_MAX
 from enact_dist.wire.payload import decode_untyped
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
 
     from enact_dist.access.session import Session
-    from enact_dist.core.protocol.messages import AspectEntry, Item, SlotState
+    from enact_dist.core.client.plan import Reading
+    from enact_dist.core.protocol.datum import Datum, Slot
+    from enact_dist.core.protocol.messages import Item, SlotState
     from enact_dist.terms import Context, LockRequest, LockRequestEach, LockRequestOne
 
 T = TypeVar("T")
@@ -113,29 +123,60 @@ def _items(
 def _items_of_each(session: Session, request: LockRequest[Any], moment: Moment) -> Iterator[Item]:
     """Yield the lines for a pattern by capture stamp, which is asked slot by slot."""
     context, pattern, aspect = request.address
-    for _, state in survey_states(session, context, pattern, (aspect,)):
+    for _, state in slot_states(session, context, pattern, (aspect,)):
         view = View(request.world, Entity(state.slot.entity), request.aspect)
         yield session.item_of(view, moment.captured_ns, nearest=moment.nearest)
 
 
-def survey_states(
+@dataclass(frozen=True, slots=True)
+class SlotInfo:
+    """One slot of a world context, without its datum.
+
+    Attributes:
+        size_bytes: Length of the datum's body: arrays, texts and bytes over 256 B, long lists; 0
+            for everything else.
+        null_reason: Why it is null, or the empty string.
+        shard: The shard that stores it.
+    """
+
+    entity: Entity
+    aspect: str
+    version: int
+    position: Position
+    size_bytes: int
+    null_reason: str
+    shard: str
+
+
+def slot_info(shard: str, state: SlotState) -> SlotInfo:
+    """Return a shard's description of a slot."""
+    return SlotInfo(
+        Entity(state.slot.entity),
+        state.slot.aspect,
+        state.version,
+        Position(state.stamp_ns, shard),
+        state.size,
+        reason_of(state),
+        shard,
+    )
+
+
+def reason_of(state: SlotState) -> str:
+    """Return why a slot is null, as `NullReason` words it; "" if it is not."""
+    return NullReason[state.null_reason].value if state.null_reason else ""
+
+
+def slot_states(
     session: Session, context: str, pattern: str, aspects: tuple[str, ...] = ()
 ) -> list[tuple[str, SlotState]]:
-    """Return the newest states of matching slots with their shards, without their data.
+    """Return the newest states of matching slots, each with its shard, without their data.
 
     Raises:
         UnknownWorldError: The cell has no such world context.
         ShardUnreachableError: A shard does not answer.
     """
-    client = session.client
-    request = Survey((context,), (pattern,), aspects)
-    shards = client.shards()
-    found = []
-    answers = client.call_all([(shard, request) for shard in shards])
-    for shard, answer in zip(shards, answers, strict=True):
-        if not isinstance(answer, Surveyed):
-            raise ProtocolError(f"{type(answer).__name__} came as the answer to Survey")
-        found += [(shard, state) for state in answer.states]
+    answers = ask_all(session.client, Surveyed, Survey((context,), (pattern,), aspects))
+    found = [(shard, state) for shard, answer in answers for state in answer.states]
     if not found:
         session.check_world(context)
     return found
@@ -186,6 +227,50 @@ def take_readings(
     finally:
         client.release(lock)
     return readings
+
+
+class HeldView(Closing):
+    """Slots as of one moment; their data can be fetched until it is closed.  Used by one thread.
+
+    Small data arrive with the states (up to 8 MiB per shard), large ones are fetched on demand,
+    even if newer ones are committed meanwhile.
+
+    Args:
+        session: The session that takes the view.
+        items: What is viewed.
+        past_ns: The timestamp to view; 0 is the present.
+
+    Attributes:
+        states: What was found, each with its shard and epoch.
+        locks: Whether read locks replaced a consistent snapshot, because commits came too fast.
+
+    Raises:
+        ForgottenError: A state as of `past_ns` has left its retention.
+        LockTimeoutError: No consistent view came within `patience_s`, or a commit with an earlier
+            timestamp is still undecided.
+        ShardUnreachableError: A shard does not answer.
+    """
+
+    def __init__(self, session: Session, items: Iterable[Item], *, past_ns: int = 0) -> None:
+        client = session.client
+        self.session = session
+        self._lock = client.acquire(items, wait_s=client.patience_s, hold_s=VIEW_S, past_ns=past_ns)
+        self.states: tuple[Reading, ...] = tuple(self._lock.states)
+        self.locks = bool(self._lock.parts)
+
+    def fetch(self, readings: Iterable[Reading]) -> dict[Slot, Datum]:
+        """Return the data of some of the states that are not null.
+
+        Raises:
+            LeaseLostError: A shard restarted, or the session rested too long: view again.
+            ShardUnreachableError: A shard does not answer.
+        """
+        client, lock = self.session.client, self._lock.lock
+        return fetch_all(client, self.session.cache, lock, readings, client.check_usable)
+
+    def close(self) -> None:
+        """Release the data; twice is harmless."""
+        self.session.client.release(self._lock)
 
 
 class Snapshot:
@@ -274,25 +359,14 @@ class Snapshot:
         return f"Snapshot({', '.join(map(repr, self._requests))})"
 
 
-def raw_datum(context: Context, session: Session, entity: Entity, aspect: str) -> object:
-    """Return a datum without knowing its Python type; as `WorldContext.raw`."""
-    check_argument("raw(entity, aspect)", "entity", entity, Entity)
-    check_argument("raw(entity, aspect)", "aspect", aspect, str)
-    known_aspect(session, aspect)
+def untyped_datum(context: Context, session: Session, entity: Entity, aspect: str) -> object:
+    """Return a datum without knowing its Python type; see `WorldContext.get_untyped`."""
+    check_argument("get_untyped(entity, aspect)", "entity", entity, Entity)
+    check_argument("get_untyped(entity, aspect)", "aspect", aspect, str)
+    if aspect not in session.client.aspect_entries():
+        session.client.greet()
+    known = session.client.aspect_entries()
+    if aspect not in known:
+        raise unknown_aspect(aspect, known)
     request = View(context, entity, Aspect(aspect, object))
     return decode_untyped(take_snapshot((request,), register=False).encoded(request))
-
-
-def known_aspect(session: Session, name: str) -> AspectEntry:
-    """Return the entry of a registered aspect.
-
-    Raises:
-        MisuseError: No such aspect is registered.
-    """
-    client = session.client
-    if name not in client.aspect_entries():
-        client.greet()
-    known = client.aspect_entries()
-    if name not in known:
-        raise unknown_aspect(name, known)
-    return known[name]

@@ -242,7 +242,7 @@ class Once:
         assert declared is not None
         context = self._bound.contexts[declared.world.name]
         only = self._bound.only if isinstance(declared.entity, Entities) else None
-        for info in context.survey(str(only or declared.entity), (declared.aspect.name,)):
+        for info in context.list_slots(str(only or declared.entity), (declared.aspect.name,)):
             view = View(context, info.entity, declared.aspect)
             last = context.view(view).get(view)
             if last is not None and last.state == "taken":

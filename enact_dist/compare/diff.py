@@ -1,6 +1,6 @@
 """Two world contexts compared datum by datum: `WorldContext.diff`.
 
-one cut over both -> versions -> the data of those that differ, some at a time -> comparators
+one snapshot of both -> versions -> the data of those that differ, batch by batch -> comparators
 
 Rules a change must keep: the compared data are of one moment if both contexts are of one cell and
 one time; a version that both sides share, in the same slot or by a fork, is equal without its
@@ -12,33 +12,35 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
 from enact_dist.access.arguments import check_pattern, check_viewable, checked_each
-from enact_dist.compare.two_worlds import aspects_of, both_in_sight, origins, same_datum
+from enact_dist.access.snapshot import slot_info
+from enact_dist.compare.two_worlds import aspects_of, both_sides, origins, same_datum
 from enact_dist.comparing import EQUAL, EXACT, Difference
 from enact_dist.errors import LeaseLostError
 from enact_dist.terms import Aspect, Entities, Entity
 from enact_dist.wire.payload import decode_datum
-from enact_dist.world.listings import slot_info
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
-    from enact_dist.compare.two_worlds import Place, Sight, Viewable
+    from enact_dist.access.snapshot import SlotInfo
+    from enact_dist.compare.two_worlds import Place, SideView, Viewable
     from enact_dist.core.client.plan import Reading
     from enact_dist.core.protocol.datum import Datum
-    from enact_dist.world.listings import SlotInfo
 
 BATCH_BYTES_MAX: Final = 64 << 20
-"""Data of so many bytes are fetched and compared together."""
+"""Most bytes of data that are fetched and compared together."""
 BATCH_PAIRS_MAX: Final = 1024
 ATTEMPTS_MAX: Final = 3
-"""Retries of a comparison when data were removed before they were fetched."""
+"""Attempts of a comparison when data were removed before they were fetched."""
+
+T = TypeVar("T")
 
 
 class DiffKind(StrEnum):
-    """How the two sides of a slot stand to each other."""
+    """How the two sides of a slot compare."""
 
     ONLY_LEFT = "only left"
     ONLY_RIGHT = "only right"
@@ -54,10 +56,10 @@ class Comparison:
     Attributes:
         entity: The entity.
         aspect: Name of the aspect.
-        kind: How the two sides stand to each other.
-        left: The version on the left side; None where it is null.
-        right: The version on the right side; None where it is null.
-        difference: How far the data are apart; None where a side is null.
+        kind: How the two sides compare.
+        left: The version on the left side; None if it is null.
+        right: The version on the right side; None if it is null.
+        difference: How far the data are apart; None if a side is null.
     """
 
     entity: Entity
@@ -68,7 +70,7 @@ class Comparison:
     difference: Difference | None
 
     def to_json(self) -> dict[str, object]:
-        """Return it as JSON can carry it; what is infinite is null there."""
+        """Return it in a form that JSON can carry; an infinite number becomes null."""
         found = self.difference or EQUAL
         return {
             "entity": self.entity.name,
@@ -86,7 +88,7 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class Diff:
-    """How two world contexts differ; true where they do, and iterates over its rows.
+    """How two world contexts differ: true if they do; iterates over its rows.
 
     Attributes:
         left: Name of the left world context.
@@ -118,7 +120,7 @@ class Diff:
         return tuple(row for row in self.rows if row.kind is kind)
 
     def to_json(self) -> dict[str, object]:
-        """Return it as JSON can carry it."""
+        """Return it in a form that JSON can carry."""
         return {
             "left": self.left,
             "right": self.right,
@@ -143,16 +145,29 @@ def diff(
         aspects = checked_each(call, "aspects", aspects, Aspect, str)
     types = aspects_of((left, right), aspects)
     places = [(str(Entities(str(entities))), name) for name in types]
-    for attempt in range(1, ATTEMPTS_MAX + 1):
+
+    def compare() -> Diff:
+        with both_sides(left, right, places, each=True) as (first, second):
+            pairs = pairs_of(first.of(left.name), second.of(right.name))
+            return _counted(left.name, right.name, compared(pairs, first, second, types))
+
+    return repeated(compare)
+
+
+def repeated(compare: Callable[[], T], before_retry: Callable[[], None] = lambda: None) -> T:
+    """Compare; repeat if data were removed before they were fetched.
+
+    That happens when a shard restarts, or the session rests too long, between the two.
+
+    Raises:
+        LeaseLostError: The data were removed in each of `ATTEMPTS_MAX` attempts.
+    """
+    for _ in range(ATTEMPTS_MAX - 1):
         try:
-            with both_in_sight(left, right, places, each=True) as (first, second):
-                pairs = pairs_of(first.of(left.name), second.of(right.name))
-                return _counted(left.name, right.name, compared(pairs, first, second, types))
+            return compare()
         except LeaseLostError:
-            # A shard restarted, or the session rested too long, between the cut and its data.
-            if attempt == ATTEMPTS_MAX:
-                raise
-    raise AssertionError("a diff ends in its rows or an error")
+            before_retry()
+    return compare()
 
 
 def _counted(left: str, right: str, found: Iterable[tuple[Comparison, bool]]) -> Diff:
@@ -194,14 +209,14 @@ def pairs_of(left: Mapping[Place, Reading], right: Mapping[Place, Reading]) -> I
 
 
 def compared(
-    pairs: Iterable[Pair], first: Sight, second: Sight, types: Mapping[str, Aspect[Any]]
+    pairs: Iterable[Pair], first: SideView, second: SideView, types: Mapping[str, Aspect[Any]]
 ) -> Iterator[tuple[Comparison, bool]]:
-    """Yield how the two sides of each pair stand, and whether they are one version; in order.
+    """Yield how the two sides of each pair compare, and whether they are one version; in order.
 
     Args:
-        pairs: Slots that are in sight.
-        first: Where the left sides are.
-        second: Where the right sides are.
+        pairs: Slots of the two views.
+        first: The view of the left side.
+        second: The view of the right side.
         types: The aspects by name.
 
     Raises:
@@ -226,7 +241,7 @@ def compared(
 
 
 def _batches(pairs: Iterable[Pair]) -> Iterator[list[Pair]]:
-    """Yield pairs together as long as their data fit into `BATCH_BYTES_MAX`."""
+    """Yield pairs in batches whose data fit into `BATCH_BYTES_MAX`."""
     batch: list[Pair] = []
     size = 0
     for pair in pairs:
@@ -240,11 +255,11 @@ def _batches(pairs: Iterable[Pair]) -> Iterator[list[Pair]]:
         yield batch
 
 
-def _same_versions(pairs: Sequence[_Whole], first: Sight, second: Sight) -> set[Place]:
+def _same_versions(pairs: Sequence[_Whole], first: SideView, second: SideView) -> set[Place]:
     """Return the slots whose two sides are one version, so that their data are the same.
 
-    Two versions are one if slot and stamp agree.  Where a context is a fork, data that could be the
-    same are followed to where they were written.
+    Two versions are one if slot and timestamp agree.  If a context is a fork, data of equal size
+    are followed back to the context where they were written.
     """
     if first.session is not second.session:
         return set()  # another cell may have the same names and stamps

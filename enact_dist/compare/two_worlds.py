@@ -1,8 +1,4 @@
-"""Slots of one or two world contexts as of one cut: their versions first, their data on demand.
-
-The data stay fetchable until the program releases them, even if newer ones are committed.  Small
-data arrive with the versions (up to 8 MiB per shard); large ones are fetched on demand.
-"""
+"""The two sides of a comparison: consistent snapshots, aspects, and what need not be fetched."""
 
 from __future__ import annotations
 
@@ -11,14 +7,12 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Protocol
 
 import numpy as np
 
-from enact_dist.access.closing import Closing
+from enact_dist.access.asking import explained
 from enact_dist.access.reads import is_null
 from enact_dist.access.session import unknown_aspect
-from enact_dist.core.protocol.datum import Slot
-from enact_dist.core.protocol.messages import Explain, Item, SlotVersion, Versions
-from enact_dist.core.protocol.parts import CAUSE_FORK, DatumRead
+from enact_dist.access.snapshot import HeldView
+from enact_dist.core.protocol.messages import CAUSE_FORK, DatumRead, Item, SlotVersion
 from enact_dist.errors import MisuseError
-from enact_dist.link.client.fetch import fetch_all
 from enact_dist.terms import Access, Aspect
 from enact_dist.wire.limits import ITEMS_MAX
 
@@ -26,15 +20,11 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
     from enact_dist.access.session import Session
-    from enact_dist.core.client.lock import MultiLock
     from enact_dist.core.client.plan import Reading
-    from enact_dist.core.protocol.datum import Datum
-    from enact_dist.link.client.locks import CellClient
+    from enact_dist.core.protocol.datum import Datum, Slot
 
-SIGHT_S: Final = 10.0
-"""How long a cut over its shards may take."""
 GENERATIONS_MAX: Final = 64
-"""How many forks of forks a version is followed through to where it was written."""
+"""How many forks of forks are followed back to the context where a version was written."""
 BLOCK_BYTES: Final = 1 << 20
 """Bytes that are compared in one step."""
 
@@ -43,7 +33,7 @@ Place = tuple[str, str]
 
 
 class Viewable(Protocol):
-    """A `WorldContext`, or a `PastContext`."""
+    """A `WorldContext` or a `PastContext`."""
 
     past: ClassVar[bool]
 
@@ -53,54 +43,20 @@ class Viewable(Protocol):
 
     @property
     def session(self) -> Session:
-        """The request that shows it."""
+        """The connection that it belongs to."""
 
 
-class Sight(Closing):
-    """What a cut showed, and the way to its data.  Used by one thread.
-
-    Attributes:
-        session: By which it was taken.
-        forked: Whether a context in it is a fork.
-    """
-
-    def __init__(self, session: Session, lock: MultiLock, *, forked: bool) -> None:
-        self.session = session
-        self.forked = forked
-        self._lock = lock
-        self._readings: dict[str, dict[Place, Reading]] = {}
-        for reading in lock.states:
-            if not is_null(reading.state):
-                context, entity, aspect = reading.state.slot
-                self._readings.setdefault(context, {})[entity, aspect] = reading
-
-    def of(self, context: str) -> dict[Place, Reading]:
-        """Return the slots of one context that are not null."""
-        return self._readings.get(context, {})
-
-    def fetch(self, readings: Iterable[Reading]) -> dict[Slot, Datum]:
-        """Return the data of some of its slots.
-
-        Raises:
-            LeaseLostError: A shard restarted, or the session rested too long: look again.
-            ShardUnreachableError: A shard does not answer.
-        """
-        client, lock = self.session.client, self._lock.lock
-        return fetch_all(client, self.session.cache, lock, readings, client.check_usable)
-
-    def close(self) -> None:
-        """Release its data; idempotent."""
-        self.session.client.release(self._lock)
-
-
-def look(worlds: Sequence[Viewable], places: Iterable[Place], *, each: bool) -> Sight:
-    """Take one cut over world contexts of one cell and one time.
+class SideView(HeldView):
+    """A consistent snapshot of one side of a comparison, or of both.
 
     Args:
-        worlds: One or two.
-        places: Entities (patterns with `each`) and aspects; of an aspect that a shard does not
-            know it shows nothing.
-        each: Whether these are patterns.
+        worlds: One or two world contexts of one cell and one time.
+        places: Entities (patterns with `each`) and aspects; an aspect that a shard does not know
+            has no slots there.
+        each: Whether the entities are patterns.
+
+    Attributes:
+        forked: Whether one of the contexts is a fork.
 
     Raises:
         ForgottenError: The past data are no longer known.
@@ -109,52 +65,53 @@ def look(worlds: Sequence[Viewable], places: Iterable[Place], *, each: bool) -> 
         UnknownWorldError: The cell no longer has one of them; checked if patterns show nothing.
         ShardUnreachableError: A shard does not answer.
     """
-    client = worlds[0].session.client
-    asked = list(places)
-    names = dict.fromkeys(world.name for world in worlds)
-    access = int(Access.VIEW_EACH if each else Access.VIEW)
-    items = [Item(access, name, *place) for name in names for place in asked]
-    if len(items) > ITEMS_MAX:
-        raise MisuseError(
-            f"asked {len(asked)} data of each of {len(names)} world contexts at once, found room"
-            f" for {ITEMS_MAX} in all; name fewer aspects"
-        )
-    past_ns = past_ns_of(worlds[0])
-    lock = client.acquire(items, wait_s=client.patience_s, hold_s=SIGHT_S, past_ns=past_ns)
-    if lock.parts:
-        # Commits came too fast for a consistent snapshot, so read locks replaced it.  No writer
-        # should wait for a comparison: release the locks and look at that moment as the past.
-        client.release(lock)
-        past_ns = client.core.seen_stamp_ns
-        lock = client.acquire(items, wait_s=client.patience_s, hold_s=SIGHT_S, past_ns=past_ns)
-    sight = Sight(worlds[0].session, lock, forked=any(map(_is_fork, worlds)))
-    try:
-        for world in worlds:
-            if each and not sight.of(world.name):
-                world.session.check_world(world.name)
-    except BaseException:
-        sight.close()
-        raise
-    return sight
+
+    def __init__(self, worlds: Sequence[Viewable], places: Iterable[Place], *, each: bool) -> None:
+        asked, session = list(places), worlds[0].session
+        names = dict.fromkeys(world.name for world in worlds)
+        access = int(Access.VIEW_EACH if each else Access.VIEW)
+        items = [Item(access, name, *place) for name in names for place in asked]
+        if len(items) > ITEMS_MAX:
+            raise MisuseError(
+                f"asked for {len(asked)} data of each of {len(names)} world contexts at once; at"
+                f" most {ITEMS_MAX} fit in all; name fewer aspects"
+            )
+        super().__init__(session, items, past_ns=past_ns_of(worlds[0]))
+        if self.locks:
+            # Commits came too fast for a consistent snapshot, so read locks replaced it.  No writer
+            # should wait for a comparison: release the locks and view that moment as the past.
+            self.close()
+            super().__init__(session, items, past_ns=session.client.core.seen_stamp_ns)
+        self.forked = any(map(_is_fork, worlds))
+        self._readings: dict[str, dict[Place, Reading]] = {}
+        for reading in self.states:
+            if not is_null(reading.state):
+                context, entity, aspect = reading.state.slot
+                self._readings.setdefault(context, {})[entity, aspect] = reading
+        try:
+            for world in worlds:
+                if each and not self.of(world.name):
+                    session.check_world(world.name)
+        except BaseException:
+            self.close()
+            raise
+
+    def of(self, context: str) -> dict[Place, Reading]:
+        """Return the slots of one context that are not null."""
+        return self._readings.get(context, {})
 
 
 @contextmanager
-def both_in_sight(
+def both_sides(
     left: Viewable, right: Viewable, places: Sequence[Place], *, each: bool
-) -> Iterator[tuple[Sight, Sight]]:
-    """Look at two world contexts: as one cut where they are of one cell and one time.
-
-    Raises:
-        ForgottenError: See `look`.
-        LockTimeoutError: See `look`.
-        ShardUnreachableError: See `look`.
-    """
-    one_cut = left.session is right.session and past_ns_of(left) == past_ns_of(right)
+) -> Iterator[tuple[SideView, SideView]]:
+    """View two world contexts, in one snapshot if they are of one cell and one time."""
+    together = left.session is right.session and past_ns_of(left) == past_ns_of(right)
     with ExitStack() as stack:
-        first = stack.enter_context(look([left, right] if one_cut else [left], places, each=each))
-        second = first
-        if not one_cut:
-            second = stack.enter_context(look([right], places, each=each))
+        worlds = [left, right] if together else [left]
+        first = second = stack.enter_context(SideView(worlds, places, each=each))
+        if not together:
+            second = stack.enter_context(SideView([right], places, each=each))
         yield first, second
 
 
@@ -162,15 +119,15 @@ def past_ns_of(world: Viewable) -> int:
     """Return the timestamp as of which a context is viewed (0: the present).
 
     Raises:
-        MisuseError: It shows data by when they were captured, which are of no one moment.
+        MisuseError: It shows data by their capture stamps, which belong to no single moment.
     """
     if not world.past:
         return 0
     at_ns: int = getattr(world, "at_ns", 0)
     if not at_ns:
         raise MisuseError(
-            f"{world!r} shows data by their capture stamps, which are of no one moment of the world"
-            " context; compare it as of a moment: at(position)"
+            f"{world!r} shows data by their capture stamps, which belong to no single moment of"
+            " the world context; compare it as of a moment: at(position)"
         )
     return at_ns
 
@@ -186,13 +143,13 @@ def aspects_of(
     *,
     later: bool = False,
 ) -> dict[str, Aspect[Any]]:
-    """Return the aspects to look at by name, each with its type as far as that is known here.
+    """Return the aspects to compare by name, each with its type if this process knows it.
 
     Args:
-        worlds: The world contexts to look at.
+        worlds: The world contexts to compare.
         wanted: Aspects, or names; None: all that these cells know.
-        later: Whether an aspect without a type that no cell knows may still come; one with a type
-            is null until then, as it is for a view.
+        later: Whether an aspect without a type may be registered later; one with a type may always,
+            and its slots are null until then.
 
     Raises:
         MisuseError: A name that no cell knows.
@@ -226,7 +183,7 @@ def _known(sessions: Iterable[Session]) -> set[str]:
 
 
 def _type_used(sessions: Iterable[Session], name: str) -> Aspect[Any]:
-    """Return an aspect as this process has used it, else without a type."""
+    """Return an aspect as this process has used it, or without a type."""
     used = [session.aspect_used(name) for session in sessions]
     return next((aspect for aspect in used if aspect is not None), Aspect(name, object))
 
@@ -235,47 +192,34 @@ def _type_used(sessions: Iterable[Session], name: str) -> Aspect[Any]:
 
 
 def origins(session: Session, readings: Iterable[Reading]) -> dict[Slot, DatumRead]:
-    """Return by slot where its version was written: a fork's copy was in what it was forked from.
+    """Return by slot where its version was written: a fork's copy comes from the forked context.
 
-    Copies bear the stamp of their fork, so nothing else is asked about.  One whose source is not
-    known any more counts as written where it is.
+    A copy has the timestamp of its fork, so only versions with that timestamp are asked about.  A
+    copy whose source is not known any more counts as written where it is.
 
     Raises:
         ShardUnreachableError: A shard does not answer.
     """
-    client = session.client
-    forked_ns = {name: entry.at_ns for name, entry in client.worlds().items() if entry.source}
-    found = {
-        one.state.slot: DatumRead(one.state.slot, one.state.version, one.state.stamp_ns)
-        for one in readings
+    forked_ns = {
+        name: entry.at_ns for name, entry in session.client.worlds().items() if entry.source
     }
-    moved = dict(found)
+    found = moved = {one.state.slot: DatumRead(*one.state[:3]) for one in readings}
     for _ in range(GENERATIONS_MAX):
         copies = {
             slot: at for slot, at in moved.items() if forked_ns.get(at.slot.context) == at.stamp_ns
         }
         if not copies:
             break
-        sources = _sources(client, copies.values())
+        asked = (SlotVersion(copy.slot, copy.version) for copy in copies.values())
+        sources = {
+            entry.state.slot: entry.cause.reads[0]
+            for answer in explained(session.client, asked)
+            for entry in answer.entries
+            if entry.cause is not None and entry.cause.kind == CAUSE_FORK and entry.cause.reads
+        }
         moved = {slot: sources[at.slot] for slot, at in copies.items() if at.slot in sources}
-        found |= moved
+        found = found | moved
     return found
-
-
-def _sources(client: CellClient, copies: Iterable[DatumRead]) -> dict[Slot, DatumRead]:
-    """Return by slot what these copies were made of, as far as that is known."""
-    asked: dict[str, list[SlotVersion]] = {}
-    for copy in copies:
-        shard = client.shard_of(copy.slot.entity)
-        asked.setdefault(shard, []).append(SlotVersion(copy.slot, copy.version))
-    answers = client.call_all([(shard, Explain(tuple(some))) for shard, some in asked.items()])
-    return {
-        entry.state.slot: entry.cause.reads[0]
-        for answer in answers
-        if isinstance(answer, Versions)
-        for entry in answer.entries
-        if entry.cause is not None and entry.cause.kind == CAUSE_FORK and entry.cause.reads
-    }
 
 
 def same_datum(left: Datum, right: Datum) -> bool:

@@ -6,12 +6,12 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.access.snapshot import HeldView
 from enact_dist.config.shows import GUESSED
 from enact_dist.core.protocol.messages import Item
 from enact_dist.recording.exact import Recorded
 from enact_dist.recording.file import RecordingFile
 from enact_dist.terms import Access
-from enact_dist.world.version_data import viewed
 
 if TYPE_CHECKING:
     import os
@@ -64,7 +64,7 @@ def world_as_of(world: WorldContext, at_ns: int = 0) -> Iterator[Recorded]:
     items = [Item(int(Access.VIEW_EACH), world.name, "**", aspect) for aspect in sorted(aspects)]
     if not items:
         return
-    with viewed(session, items, at_ns=at_ns) as view:
+    with HeldView(session, items, past_ns=at_ns) as view:
         states = [reading for reading in view.states if not reading.state.null_reason]
         for portion in _portions(sorted(states, key=lambda reading: reading.state.slot)):
             data = view.fetch(portion)

@@ -27,7 +27,7 @@ from enact_dist.recording.exact import Recorded
 from enact_dist.recording.file import CHUNK_BYTES, CHUNK_S, RecordingFile
 from enact_dist.recording.settling import END_S, Settling
 from enact_dist.terms import Entities, NullReason
-from enact_dist.world.version_data import Found, Wanted, between, explained, found_of
+from enact_dist.world.version_data import Retained, Wanted, between, explained, found_of
 
 if TYPE_CHECKING:
     import os
@@ -394,7 +394,7 @@ class Recorder:
         self,
         known: Sequence[Wanted],
         entries: Mapping[Wanted, VersionEntry],
-        found: Mapping[Wanted, Found],
+        found: Mapping[Wanted, Retained],
     ) -> None:
         for group in _commits(known, entries):
             stamp_ns = group[0].stamp_ns
@@ -418,7 +418,7 @@ class Recorder:
                 for wanted in sorted(gone - self._nulls):
                     self._miss_one(wanted, DROPPED)
                 ends = sorted(gone & self._nulls)
-                found = {wanted: Found(NullReason.DELETED.name, None) for wanted in ends}
+                found = {wanted: Retained(NullReason.DELETED.name, None) for wanted in ends}
                 self._write_commits(ends, {}, found)
                 self._nulls -= gone
 
@@ -428,7 +428,7 @@ class Recorder:
         commit: int,
         log_ns: int,
         entries: Mapping[Wanted, VersionEntry],
-        found: Mapping[Wanted, Found],
+        found: Mapping[Wanted, Retained],
     ) -> None:
         self.summary.versions += len(group)
         versions = tuple(_recorded(w, entries.get(w), found[w], commit) for w in group)
@@ -483,7 +483,7 @@ def _commits(
         yield from by_lock.values()
 
 
-def _recorded(wanted: Wanted, entry: VersionEntry | None, found: Found, commit: int) -> Recorded:
+def _recorded(wanted: Wanted, entry: VersionEntry | None, found: Retained, commit: int) -> Recorded:
     cause = entry.cause if entry is not None else None
     return Recorded(
         wanted.slot,

@@ -344,7 +344,7 @@ class Replay:
     def _refuse_data(self, world: WorldContext) -> None:
         if self._overwrite:
             return
-        found = [info for info in world.survey() if not info.null_reason]
+        found = [info for info in world.list_slots() if not info.null_reason]
         if found:
             old = self._recorded(world.name)
             raise MisuseError(

@@ -9,11 +9,12 @@ from __future__ import annotations
 import atexit
 import contextlib
 import time
+import warnings
 import weakref
 from typing import TYPE_CHECKING, Any
 
 from enact_dist.access.arguments import check_reason
-from enact_dist.access.asking import await_stamp
+from enact_dist.access.asking import ask_all, await_stamp
 from enact_dist.access.closing import Closing
 from enact_dist.access.lock import refuse_inside_lock
 from enact_dist.access.session import Session
@@ -27,6 +28,7 @@ from enact_dist.core.protocol.messages import (
     ListLocks,
     ListSessions,
     Locks,
+    Sessions,
     Welcome,
 )
 from enact_dist.errors import EnactError, MisuseError
@@ -34,8 +36,7 @@ from enact_dist.link.client.dropped import when_dropped
 from enact_dist.terms import checked_name
 from enact_dist.world.context import WorldContext
 from enact_dist.world.forks import drop_world
-from enact_dist.world.history import keep_versions, kept_versions, let_go
-from enact_dist.world.lineage import causes_of, effects_of
+from enact_dist.world.lineage import CauseTree, EffectTree, tree_of
 from enact_dist.world.listings import (
     ActorInfo,
     AspectInfo,
@@ -47,19 +48,20 @@ from enact_dist.world.listings import (
     lock_info,
     shard_info,
 )
+from enact_dist.world.pins import pin_versions, pinned_versions, unpin_versions
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from enact_dist.link.client.locks import CellClient
     from enact_dist.terms import Aspect, Entity
-    from enact_dist.world.history import Version
-    from enact_dist.world.lineage import CauseTree, EffectTree, Made
+    from enact_dist.world.context import Version
+    from enact_dist.world.lineage import Made
 
 _open: weakref.WeakKeyDictionary[CellClient, Any] = weakref.WeakKeyDictionary()
 """The sessions of cells that were not closed, with the shard inside this process, if it has one.
 
-Handles made by a cell go on working after the program has dropped its last reference to the cell.
+Handles of a cell keep working after the program has dropped its last reference to the cell.
 """
 
 
@@ -82,8 +84,7 @@ class Cell(Closing):
         self._host = host
         self._dropped = when_dropped(client, name, host)
         _open[client] = host
-        # What is registered last runs first: before the transport's own end, over which the
-        # goodbyes have to go.
+        # What is registered last runs first: the transport, which carries the goodbyes, ends later.
         atexit.unregister(_close_all)
         atexit.register(_close_all)
 
@@ -111,12 +112,12 @@ class Cell(Closing):
         return WorldContext(name, self._session)
 
     def create_world(self, name: str) -> WorldContext:
-        """Make a world context, or return the one that exists.
+        """Make a world context, or return the existing one.
 
         Raises:
             LockHeldError: This thread holds a lock.
             MisuseError: The connection only observes.
-            UnknownWorldError: Some shards have it as a fork that is not complete.
+            UnknownWorldError: Some shards have it as an incomplete fork.
             ValueError: The name is not allowed.
         """
         refuse_inside_lock("create_world")
@@ -133,59 +134,75 @@ class Cell(Closing):
         stay as they are.  A new context may have the same name; version numbers never repeat.
 
         Returns:
-            How many slots went.
+            How many slots were deleted.
 
         Raises:
             UnknownWorldError: The cell has none of that name.
             MisuseError: A lock is held or awaited in it, or `cell.toml` names it.
             LockHeldError: This thread holds a lock.
-            ShardUnreachableError: A shard does not answer; the message says where it is gone.
+            ShardUnreachableError: A shard does not answer; the message names the shards that have
+                dropped it.
         """
         refuse_inside_lock("drop_world")
         self._client.check_usable()
         return drop_world(self._session, name)
 
-    # ---------------------------------------------------------------- kept versions
+    # ---------------------------------------------------------------- pinned versions
 
-    def keep(self, label: str, versions: Iterable[Version[Any] | Made]) -> None:
-        """Keep versions from being forgotten, whatever their retention, until `let_go`.
+    def pin(self, label: str, versions: Iterable[Version[Any] | Made]) -> None:
+        """Retain versions, whatever their aspect's retention, until `unpin`.
 
-        They stay listed and readable (`Version.datum`), and count in the shard's room.  Asked again
-        with the same label, versions are added.
+        They stay listed and readable (`Version.datum`), and count in the shard's room.  A second
+        call with the same label adds versions.
 
         Args:
             label: Letters, digits, ``_ . -``, slashes between.
-            versions: As `WorldContext.history` or `kept` returns them, or those of a tree of
+            versions: As `WorldContext.history` or `pinned` returns them, or those of a tree of
                 `why` or `impact` (`tree.walk()`) that are `known`.
 
         Raises:
-            ForgottenError: Some had gone before; the others are kept.
+            ForgottenError: Some had left their retention before; the others are pinned.
             MisuseError: The label cannot be used, or something is no version.
-            ShardUnreachableError: A shard does not answer; asking again does no harm.
+            ShardUnreachableError: A shard does not answer; the call can be repeated safely.
         """
         self._client.check_usable()
-        keep_versions(self._session, label, versions)
+        pin_versions(self._session, label, versions)
 
-    def kept(self) -> dict[str, tuple[Version[Any], ...]]:
-        """Return the versions that are kept, by label; their aspects are of the type `object`.
+    def pinned(self) -> dict[str, tuple[Version[Any], ...]]:
+        """Return the pinned versions by label; their aspects are of the type `object`.
 
         Raises:
             ShardUnreachableError: A shard does not answer.
         """
         self._client.check_usable()
-        return kept_versions(self._session, lambda name: WorldContext(name, self._session))
+        return pinned_versions(self._session)
 
-    def let_go(self, label: str) -> None:
-        """Release the versions of a label; what no other label and no retention keeps is removed.
+    def unpin(self, label: str) -> None:
+        """Release the versions of a label; those without another label follow their retention.
 
-        Nothing where the label keeps nothing.
+        A label without versions is no error.
 
         Raises:
             MisuseError: No version can have that label.
-            ShardUnreachableError: A shard does not answer; asking again does no harm.
+            ShardUnreachableError: A shard does not answer; the call can be repeated safely.
         """
         self._client.check_usable()
-        let_go(self._session, label)
+        unpin_versions(self._session, label)
+
+    def keep(self, label: str, versions: Iterable[Version[Any] | Made]) -> None:
+        """Pin versions.  Deprecated: use `pin`."""
+        _renamed("keep", "pin")
+        self.pin(label, versions)
+
+    def kept(self) -> dict[str, tuple[Version[Any], ...]]:
+        """Return the pinned versions.  Deprecated: use `pinned`."""
+        _renamed("kept", "pinned")
+        return self.pinned()
+
+    def let_go(self, label: str) -> None:
+        """Unpin versions.  Deprecated: use `unpin`."""
+        _renamed("let_go", "unpin")
+        self.unpin(label)
 
     def wait(self, position: Position, *, timeout_s: float = 10.0) -> bool:
         """Wait until everything committed up to `position` is visible; say whether it is.
@@ -216,19 +233,19 @@ class Cell(Closing):
     def outcome(self, lock_id: str, *, timeout_s: float = 10.0) -> Position | None:
         """Ask what became of a commit that ended in `CommitUnknownError`.
 
-        A commit that its shard has not taken yet never comes true after this.
+        A commit that its shard has not received yet is ruled out by this call.
 
         Args:
-            lock_id: As the error has it; any process of the cell may ask.
-            timeout_s: How long the shard may stay without an answer.
+            lock_id: As in the error; any process of the cell may ask.
+            timeout_s: How long to wait for an answer of the shard.
 
         Returns:
             The position of the commit, or None if nothing was written.
 
         Raises:
-            CommitUnknownError: The shard cannot tell (any more): 64 later commits of the process
+            CommitUnknownError: The shard does not know (any more): 64 later commits of the process
                 have ended in this error, too, or the process has been gone for a day.
-            PermissionDeniedError: Another process made the commit and lives; nothing was written
+            PermissionDeniedError: The process that made the commit is alive; nothing is written
                 yet, and only that process can rule out that it will be.
             ShardUnreachableError: The shard does not answer.
             LockHeldError: This thread holds a lock.
@@ -268,7 +285,7 @@ class Cell(Closing):
             UnknownWorldError: The cell has no world context of that name.
             ShardUnreachableError: A shard does not answer.
         """
-        return causes_of(self._session, (world, entity, aspect), version, depth)
+        return tree_of(CauseTree, self._session, (world, entity, aspect), version, depth)
 
     def impact(
         self,
@@ -279,12 +296,12 @@ class Cell(Closing):
         *,
         depth: int | None = None,
     ) -> EffectTree:
-        """Return what came of a datum: which versions it went into, and these, and so on.
+        """Return what was made from a datum: the versions it went into, and those made from them.
 
         Arguments and errors are those of `why`.  Effects that have left their retention cannot be
         found any more.
         """
-        return effects_of(self._session, (world, entity, aspect), version, depth)
+        return tree_of(EffectTree, self._session, (world, entity, aspect), version, depth)
 
     # ---------------------------------------------------------------- people
 
@@ -292,17 +309,14 @@ class Cell(Closing):
         """Return all locks held or awaited, oldest first within each shard.
 
         Args:
-            shards: Where to look; everywhere unless given.
+            shards: The shards to ask; None means all.
 
         Raises:
             ShardUnreachableError: A shard does not answer.
         """
-        shards = self._client.shards() if shards is None else tuple(shards)
-        answers = self._client.call_all([(shard, ListLocks()) for shard in shards])
         return tuple(
             lock_info(shard, holder)
-            for shard, answer in zip(shards, answers, strict=True)
-            if isinstance(answer, Locks)
+            for shard, answer in ask_all(self._client, Locks, ListLocks(), shards)
             for holder in answer.holders
         )
 
@@ -322,7 +336,7 @@ class Cell(Closing):
     def force_abort(self, number: int, *, shard: str, reason: str) -> LockInfo | None:
         """Abort a lock in doubt whose deciding shard is permanently lost; the shard audits it.
 
-        If that shard had committed the lock after all, only a part of its writes stands then.
+        If that shard had committed the lock after all, only a part of its writes takes effect.
 
         Returns:
             What the lock was, or None if no such lock is in doubt.
@@ -335,20 +349,17 @@ class Cell(Closing):
         return self._ended_by_hand(shard, ForceAbort(number, reason, self._epoch(shard)))
 
     def audit(self, shards: Iterable[str] | None = None) -> tuple[AuditInfo, ...]:
-        """Return what operators did and what came of it, oldest first; `shards` as in `locks`.
+        """Return acts of operators and their outcomes, oldest first; `shards` as in `locks`.
 
-        An "alarm" is a lock that `force_abort` has ended on one shard though another had committed
-        it: only a part of its writes stands.
+        An "alarm" is a lock that `force_abort` ended on one shard although another one had
+        committed it: only a part of its writes took effect.
 
         Raises:
             ShardUnreachableError: A shard does not answer.
         """
-        shards = self._client.shards() if shards is None else tuple(shards)
-        answers = self._client.call_all([(shard, ListAudit("")) for shard in shards])
         found = [
             AuditInfo(shard, entry.wall_ns / 1e9, entry.kind, entry.text, entry.identity)
-            for shard, answer in zip(shards, answers, strict=True)
-            if isinstance(answer, Audited)
+            for shard, answer in ask_all(self._client, Audited, ListAudit(""), shards)
             for entry in answer.entries
         ]
         return tuple(sorted(found, key=lambda entry: entry.stamp_s))
@@ -364,9 +375,9 @@ class Cell(Closing):
             raise MisuseError("how= is empty: state how the alarms were settled")
         check_reason("how", how)
         self._check_shard(shard)
-        seen = self._client.call(shard, ListAudit(""))
-        stamps_ns = [e.wall_ns for e in seen.entries] if isinstance(seen, Audited) else []
-        self._client.call(shard, ListAudit(how, max(stamps_ns, default=0)))
+        ((_, seen),) = ask_all(self._client, Audited, ListAudit(""), (shard,))
+        newest_ns = max((entry.wall_ns for entry in seen.entries), default=0)
+        self._client.call(shard, ListAudit(how, newest_ns))
 
     def _check_shard(self, shard: str) -> None:
         if shard not in self._client.shards():
@@ -376,27 +387,26 @@ class Cell(Closing):
             )
 
     def _epoch(self, shard: str) -> int:
-        """Return the epoch in which a shard gives its numbers."""
+        """Return the epoch in which a shard counts its locks."""
         self._check_shard(shard)
-        answer = self._client.call(shard, ListLocks())
-        return answer.epoch if isinstance(answer, Locks) else 0
+        ((_, answer),) = ask_all(self._client, Locks, ListLocks(), (shard,))
+        return answer.epoch
 
     def _ended_by_hand(self, shard: str, request: Break | ForceAbort) -> LockInfo | None:
-        answer = self._client.call(shard, request)
-        holder = answer.holder if isinstance(answer, Broken) else None
-        return lock_info(shard, holder) if holder is not None else None
+        ((_, answer),) = ask_all(self._client, Broken, request, (shard,))
+        return lock_info(shard, answer.holder) if answer.holder is not None else None
 
     def shards(self) -> tuple[ShardInfo, ...]:
-        """Return every shard of the cell, unreachable ones too, with why where that is known."""
+        """Return every shard of the cell; of an unreachable one with the reason if it is known."""
         return tuple(shard_info(self._client, shard) for shard in self._client.shards())
 
     def welcomes(self) -> dict[str, Welcome]:
-        """Return what each shard that answers at once says of the cell: its placement, contexts."""
+        """Return how each shard that answers at once describes the cell: placement, contexts."""
         client = self._client
         names = client.shards()
         answers = client.call_once([(name, client.core.hello(name)) for name in names])
-        said = zip(names, answers, strict=True)
-        return {name: answer for name, answer in said if isinstance(answer, Welcome)}
+        pairs = zip(names, answers, strict=True)
+        return {name: answer for name, answer in pairs if isinstance(answer, Welcome)}
 
     def actors(self) -> tuple[ActorInfo, ...]:
         """Return the sessions of named actors over all shards.
@@ -404,9 +414,7 @@ class Cell(Closing):
         Raises:
             ShardUnreachableError: A shard does not answer.
         """
-        shards = self._client.shards()
-        answers = self._client.call_all([(shard, ListSessions()) for shard in shards])
-        return actor_infos(zip(shards, answers, strict=True))
+        return actor_infos(ask_all(self._client, Sessions, ListSessions()))
 
     @property
     def session(self) -> str:
@@ -416,8 +424,8 @@ class Cell(Closing):
     def namesakes(self, name: str) -> tuple[ActorInfo, ...]:
         """Return the other sessions of actors of a name that are not silent.
 
-        All shards are asked: the other may have spoken with one of them alone.  None is waited
-        for longer than one call takes.
+        All shards are asked, because the other may be known to one of them alone; none is waited
+        for longer than one call.
         """
         client = self._client
         shards = client.shards()
@@ -432,14 +440,14 @@ class Cell(Closing):
         )
 
     def set_report(self, report: bytes) -> None:
-        """Let keep-alives carry an actor's statistics: msgpack of a map, shown up to 4 KiB."""
+        """Send an actor's statistics with the keep-alives: msgpack of a map, up to 4 KiB."""
         self._client.set_report(report)
 
     def aspects(self, *, enough: str = "") -> dict[str, tuple[str, str]]:
         """Return the registered aspects: name to (fingerprint of the type, durability).
 
         Args:
-            enough: Once shards that answer know an aspect of this name, no other is waited for.
+            enough: Once a shard that answers knows an aspect of this name, no other is awaited.
 
         Raises:
             ShardUnreachableError: A shard does not answer.
@@ -449,7 +457,7 @@ class Cell(Closing):
         return {name: (entry.fingerprint, entry.durability) for name, entry in entries.items()}
 
     def aspect_infos(self, world: str = "") -> tuple[AspectInfo, ...]:
-        """Return the registered aspects, and how much of them is in one world context, or all.
+        """Return the registered aspects, and how many data they have in one world context, or all.
 
         Raises:
             ShardUnreachableError: A shard does not answer.
@@ -463,7 +471,7 @@ class Cell(Closing):
     # ---------------------------------------------------------------- end
 
     def close(self) -> None:
-        """Give back everything and end the connection; twice is harmless."""
+        """Release everything and end the connection; twice is harmless."""
         _open.pop(self._client, None)
         self._dropped.detach()
         try:
@@ -475,6 +483,11 @@ class Cell(Closing):
 
     def __repr__(self) -> str:
         return f"<cell {self.name!r}, {len(self._client.shards())} shards>"
+
+
+def _renamed(old: str, new: str) -> None:
+    """Warn of a method that has another name since this release; the next one drops the old."""
+    warnings.warn(f"Cell.{old} is now Cell.{new}", DeprecationWarning, stacklevel=3)
 
 
 def _close_all() -> None:

@@ -9,12 +9,11 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from enact_dist.access.arguments import check_seconds
+from enact_dist.access.arguments import check_seconds, checked_as
 from enact_dist.core.client.client import Client
 from enact_dist.core.protocol.messages import PlacementMap, ShardEntry, Welcome
 from enact_dist.errors import ConfigError, LinkError, MisuseError
 from enact_dist.link.zenoh.endpoints import PROTOCOLS, split_endpoint
-from enact_dist.terms import checked_name
 from enact_dist.wire.limits import NAME_CHARACTERS_MAX
 from enact_dist.wire.texts import is_safe, shown
 from enact_dist.world.cell import Cell
@@ -148,10 +147,7 @@ def local(
 def _world_names(worlds: Sequence[str]) -> tuple[str, ...]:
     if isinstance(worlds, str):
         raise MisuseError(f"worlds={worlds!r} is one string; write worlds=[{worlds!r}]")
-    try:
-        return tuple(checked_name("world context", name, slashes=False) for name in worlds)
-    except ValueError as error:
-        raise MisuseError(str(error)) from None
+    return tuple(checked_as("world context", name) for name in worlds)
 
 
 def _is_endpoint(target: str | Path) -> bool:

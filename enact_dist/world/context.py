@@ -1,12 +1,20 @@
-"""A world context as its user sees it: data to begin with, views, watches, its past, its forks.
+"""A world context as its user sees it: initial data, views, watches, history, past and forks.
 
 A world context W maps (entity, aspect) to a datum or null (ENACT 3.2); `WorldContext` is the
 handle, the map itself lies on the shards.
+
+::
+
+    for version in online.history(piece, LOWEST, count=5):
+        print(version.version, version.position, version.datum())
+
+A history carries no data: `Version.datum` fetches one.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, TypeVar, overload
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
 
 from enact_dist.access.arguments import (
     Moment,
@@ -17,37 +25,35 @@ from enact_dist.access.arguments import (
     checked_each,
     stamp_of,
 )
+from enact_dist.access.asking import listed
 from enact_dist.access.lock import Lock, refuse_inside_lock
-from enact_dist.access.snapshot import Snapshot, raw_datum, survey_states, take_snapshot
+from enact_dist.access.reads import null_error
+from enact_dist.access.snapshot import Snapshot, reason_of, take_snapshot
 from enact_dist.access.watch import Watch
-from enact_dist.errors import MisuseError
-from enact_dist.terms import Aspect, Context, Entities, Entity, Write
+from enact_dist.core.protocol.datum import Position, Slot
+from enact_dist.errors import ForgottenError, MisuseError
+from enact_dist.link.refusals import moment_name
+from enact_dist.terms import Aspect, Entities, Entity, View, Write
+from enact_dist.wire.payload import decode_untyped
 from enact_dist.world.forks import fork_world
-from enact_dist.world.history import Version, versions_of
-from enact_dist.world.listings import SlotInfo, slot_info
-from enact_dist.world.past import PastContext
+from enact_dist.world.past import CellContext, PastContext
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from enact_dist.access.session import Session
     from enact_dist.access.together import Together
-    from enact_dist.compare.diff import Diff
     from enact_dist.compare.two_worlds import Viewable
     from enact_dist.compare.watch_diff import DiffWatch
+    from enact_dist.core.protocol.messages import Cause, VersionEntry
     from enact_dist.terms import LockRequest
 
 T = TypeVar("T")
 
 
-class WorldContext(Context):
+class WorldContext(CellContext):
     """A named map from (entity, aspect) to a datum; made by `Cell.world`."""
 
-    __slots__ = ("session",)
-
-    def __init__(self, name: str, session: Session) -> None:
-        super().__init__(name)
-        self.session = session
+    __slots__ = ()
 
     def init(self, entity: Entity, aspect: Aspect[T], datum: T) -> bool:
         """Set a datum that is null; afterwards it changes only through a lock (ENACT 3.3).
@@ -79,13 +85,13 @@ class WorldContext(Context):
         All data are of one moment, over shards too: every commit is shown whole or not at all.
 
         Args:
-            requests: `View`s and `ViewEach`es of this cell, and at most one `Together`: then the
-                newest set of it that is complete is shown, and the rest as it is now.
+            requests: `View`s and `ViewEach`es of this cell, and at most one `Together`, whose
+                newest complete set is shown; everything else is shown as it is now.
 
         Raises:
             LockHeldError: This thread holds a lock; name the views in it instead.
             LockTimeoutError: No consistent view came within `patience_s`: shards keep
-                restarting, or constantly written data are locked for long.
+                restarting, or data that are written all the time stay locked for long.
             MisuseError: A request locks.
             NullDatumError: The `Together` has no complete set.
             ShardUnreachableError: A shard does not answer.
@@ -94,7 +100,7 @@ class WorldContext(Context):
         return take_snapshot(requests)
 
     def watch(self, entities: Entities | Entity | str, *aspects: Aspect[Any]) -> Watch:
-        """Follow the changes of matching slots: the present data, then every change in order.
+        """Follow matching slots: first their present data, then every change in order.
 
         Args:
             entities: A pattern or one entity.
@@ -118,49 +124,16 @@ class WorldContext(Context):
         names = tuple(aspect.name for aspect in aspects)
         return Watch(self.session.client, (self.name,), tuple(patterns), names)
 
-    def diff(
-        self,
-        other: Viewable,
-        entities: Entities | Entity | str = "**",
-        aspects: Iterable[Aspect[Any] | str] | None = None,
-    ) -> Diff:
-        """Compare this world context (left) with another one (right), datum by datum.
-
-        Both are seen as one cut; one that is past, as it was.  Data are compared by the comparator
-        of their aspect, exactly where it names none; an aspect whose type is not known in this
-        process is compared without it, dataclasses as dicts.  What is one version on both sides
-        is not fetched.
-
-        Args:
-            other: A world context, also a past one; of another cell, too, and then seen as a cut
-                of its own.
-            entities: A pattern or one entity.
-            aspects: Aspects, or their names; None means all.
-
-        Raises:
-            LockHeldError: This thread holds a lock.
-            ForgottenError: A past context is beyond retention.
-            TypeError: An argument is of another type.
-            MisuseError: No program has registered one of the named aspects.
-            UnknownWorldError: The cell no longer has one of them.
-            DatumTypeError: An aspect is registered with another type.
-            ShardUnreachableError: A shard does not answer.
-        """
-        from enact_dist.compare.diff import diff
-
-        refuse_inside_lock("diff")
-        return diff(self, other, entities, aspects)
-
     def watch_diff(
         self,
         other: Viewable,
         entities: Entities | Entity | str = "**",
         *aspects: Aspect[Any],
     ) -> DiffWatch:
-        """Follow where this world context and another one of the cell differ: a standing diff.
+        """Follow where this world context and another one of the cell differ: a continuous diff.
 
-        First come the slots that differ now, then each whose comparison crosses its tolerance, in
-        either direction, or that comes or goes on one side; see `DiffWatch`.
+        First come the slots that differ now.  Then comes each slot whose comparison crosses its
+        tolerance, in either direction, or that appears or disappears on one side; see `DiffWatch`.
 
         Args:
             other: A world context of the same connection; also a past one, as a reference.
@@ -183,34 +156,6 @@ class WorldContext(Context):
         checked_each("watch_diff(other, entities, *aspects)", "aspects", aspects, Aspect, str)
         return DiffWatch(self, other, str(entities), aspects)
 
-    def survey(
-        self, entities: Entities | str = "**", aspects: tuple[str, ...] = ()
-    ) -> tuple[SlotInfo, ...]:
-        """List the slots that match, null ones too, without their data.
-
-        Raises:
-            ShardUnreachableError: A shard does not answer.
-        """
-        check_pattern("survey(entities, aspects)", "entities", entities)
-        names = checked_each("survey(entities, aspects)", "aspects", aspects, str)
-        found = survey_states(self.session, self.name, str(Entities(str(entities))), names)
-        infos = [slot_info(shard, state) for shard, state in found]
-        return tuple(sorted(infos, key=lambda info: (info.entity, info.aspect)))
-
-    def entities(self, pattern: Entities | str = "**") -> tuple[Entity, ...]:
-        """Return the entities that have some datum here."""
-        infos = self.survey(pattern)
-        return tuple(sorted({info.entity for info in infos if not info.null_reason}))
-
-    def raw(self, entity: Entity, aspect: str) -> object:
-        """Return a datum without knowing its Python type: dataclasses come as dicts.
-
-        Raises:
-            NullDatumError: It is null.
-            MisuseError: No such aspect is registered.
-        """
-        return raw_datum(self, self.session, entity, aspect)
-
     # ---------------------------------------------------------------- in time
 
     def history(
@@ -223,13 +168,13 @@ class WorldContext(Context):
     ) -> tuple[Version[T], ...]:
         """List the versions of a datum that are still known, the oldest first, without their data.
 
-        Whatever this process has committed is among them.
+        All commits of this process are included.
 
         Args:
             entity: The entity.
-            aspect: The aspect; ``Aspect(name, object)`` where its type is not known.
+            aspect: The aspect; ``Aspect(name, object)`` if its type is not known.
             since: Only versions that were current after this moment; None: all.
-            count: Only the newest so many; None: all.
+            count: At most this many, the newest ones; None: all.
 
         Raises:
             UnknownWorldError: The cell no longer has this world context.
@@ -242,7 +187,15 @@ class WorldContext(Context):
         if count is not None and (type(count) is not int or count < 1):
             raise MisuseError(f"count is {count!r}; it must be a number of versions above 0")
         since_ns = stamp_of(since, seen_ns=self._seen_ns) if since is not None else 0
-        return versions_of(self, entity, aspect, since_ns=since_ns, count=count or 0)
+        client = self.session.client
+        client.check_usable()
+        shard = client.shard_of(entity.name)
+        self.session.settle(shard)
+        slot = Slot(self.name, entity.name, aspect.name)
+        entries = listed(client, shard, slot, since_ns=since_ns, count=count or 0)
+        if not entries:
+            self.session.check_world(self.name)
+        return tuple(Version.of(shard, self, aspect, entry) for entry in entries)
 
     @overload
     def at(self, when: When, /) -> PastContext: ...
@@ -256,10 +209,10 @@ class WorldContext(Context):
         Args:
             when: As of this moment: the `Position` of a commit (this one included), an aware
                 `datetime` or seconds since 1970.
-            stamp_ns: In its place: each datum as it was captured at this stamp (`lock.put(…,
-                stamp_ns=…)`), its newest such version; null where none is known.
-            nearest: Of each datum the version whose capture stamp lies nearest to `stamp_ns`, of
-                two as near the later one.
+            stamp_ns: Instead of `when`: each datum as it was captured at this stamp
+                (`lock.put(…, stamp_ns=…)`), its newest such version; null if none is known.
+            nearest: Take of each datum the version whose capture stamp is nearest to `stamp_ns`;
+                if two are equally near, the later one.
 
         Raises:
             MisuseError: The moment is invalid or in the future, or both or neither are given.
@@ -280,9 +233,9 @@ class WorldContext(Context):
         return self.session.client.core.seen_stamp_ns
 
     def fork(self, name: str, *, at: When | None = None) -> WorldContext:
-        """Make another world context with the data of this one; a write to either stays there.
+        """Make another world context with the data of this one; later writes stay in their own.
 
-        Copies pointers, not data, in one step on each shard, and of one cut over all of them.
+        Copies pointers, not data, in one step on each shard, from one consistent snapshot of all.
 
         Args:
             name: Name of the new context; it must not exist yet.
@@ -297,7 +250,8 @@ class WorldContext(Context):
             UnknownWorldError: The cell no longer has this world context.
             LockHeldError: This thread holds a lock.
             ShardUnreachableError: A shard does not answer; the message says how to go on.
-            LinkError: A commit stamped before stays undecided; the message says how to go on.
+            LinkError: A commit with an earlier timestamp stays undecided; the message says how to
+                go on.
         """
         refuse_inside_lock("fork")
         self.session.client.check_usable()
@@ -313,3 +267,90 @@ class WorldContext(Context):
         """
         entry = self.session.client.worlds().get(self.name)
         return (entry.source, entry.at_ns) if entry is not None and entry.source else None
+
+
+@dataclass(frozen=True, slots=True)
+class Version(Generic[T]):
+    """One version of a datum, without it.
+
+    Attributes:
+        world: Its world context.
+        entity: Its entity.
+        aspect: Its aspect; of the type `object` if the program has not named the aspect's type.
+        version: Its number, counted from 1 by slot.
+        position: Position of its commit.
+        until_ns: Stamp of the version that replaced it; 0: it is the newest one.
+        stamp_ns: When the datum was captured; 0: unknown.
+        size_bytes: Length of the datum's body: arrays, texts and bytes over 256 B, long lists; 0
+            for everything else.
+        null_reason: Why it is null, or the empty string.
+        pinned: The labels that pin it.
+        cause: Its writer and inputs; None if unknown.
+    """
+
+    world: WorldContext
+    entity: Entity
+    aspect: Aspect[T]
+    version: int
+    position: Position
+    until_ns: int
+    stamp_ns: int
+    size_bytes: int
+    null_reason: str
+    pinned: tuple[str, ...]
+    cause: Cause | None
+
+    @classmethod
+    def of(
+        cls, shard: str, world: WorldContext, aspect: Aspect[T], entry: VersionEntry
+    ) -> Version[T]:
+        """Return a version as its shard has listed it."""
+        state = entry.state
+        return cls(
+            world,
+            Entity(state.slot.entity),
+            aspect,
+            state.version,
+            Position(state.stamp_ns, shard),
+            entry.until_ns,
+            state.captured_ns,
+            state.size,
+            reason_of(state),
+            entry.kept,
+            entry.cause,
+        )
+
+    @property
+    def slot(self) -> Slot:
+        """What it is a version of."""
+        return Slot(self.world.name, self.entity.name, self.aspect.name)
+
+    def datum(self) -> T:
+        """Fetch the datum; if the aspect is of no known type, as `get_untyped` returns it.
+
+        Raises:
+            ForgottenError: It has left its retention since it was listed, or its context is gone.
+            NullDatumError: The version is null.
+            DatumTypeError: It is of another type than the aspect.
+            ShardUnreachableError: Its shard does not answer.
+        """
+        past = PastContext(self.world.name, self.world.session, Moment(self.position.stamp_ns))
+        request = View(past, self.entity, self.aspect)
+        untyped = self.aspect.datum_type is object
+        snapshot = take_snapshot((request,), register=not untyped)
+        state = snapshot.state(request)
+        shown = (state.version, state.stamp_ns) if state is not None else (0, 0)
+        if shown != (self.version, self.position.stamp_ns):
+            raise ForgottenError(
+                f"version {self.version} of {self.slot}, committed at"
+                f" {moment_name(self.position.stamp_ns)}, is not known any more; list the history"
+                " again"
+            )
+        if self.null_reason:
+            raise null_error(self.slot, state)
+        datum: Any = decode_untyped(snapshot.encoded(request)) if untyped else snapshot[request]
+        return datum  # type: ignore[no-any-return]  # of the aspect's type, or the aspect has none
+
+    def __repr__(self) -> str:
+        null = f", null: {self.null_reason}" if self.null_reason else ""
+        return f"Version({self.slot} v{self.version} at {self.position.stamp_ns}{null})"

@@ -1,9 +1,9 @@
-"""Forks and ends of world contexts: one step on each shard, reported as one.
+"""World contexts are forked and dropped in one step on each shard, reported as one.
 
-Every shard forks as of the same stamp.  A fork that only some shards have is not a world
-context yet: no caller gets a handle of it, and a repeated call with the same source and stamp
-completes it.  If a shard no longer has the data of that stamp, the fork cannot be completed; the
-client then drops it on the other shards.
+Every shard forks as of the same timestamp.  A fork that only some shards have is not a world
+context yet: no caller gets a handle of it, and a repeated call with the same source and timestamp
+completes it.  If a shard no longer has the data of that timestamp, the fork cannot be completed;
+the client then drops it on the other shards.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ import logging
 import time
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.access.asking import present_ns
+from enact_dist.access.arguments import checked_as
+from enact_dist.access.asking import ask_all, expected, present_ns
 from enact_dist.core.client.lock import OVERLOAD
 from enact_dist.core.protocol.messages import (
     Dropped,
@@ -25,16 +26,9 @@ from enact_dist.core.protocol.messages import (
     Refused,
     WorldEntry,
 )
-from enact_dist.errors import (
-    EnactError,
-    LinkError,
-    MisuseError,
-    ProtocolError,
-    ShardUnreachableError,
-)
+from enact_dist.errors import EnactError, LinkError, MisuseError, ShardUnreachableError
 from enact_dist.link.client.session import FINISH_S
 from enact_dist.link.refusals import error_of, holder_line, moment_name
-from enact_dist.terms import checked_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -46,17 +40,14 @@ UNDO_S: Final = 2.0
 """Time to drop a fork that cannot be completed; the log names shards that may still have it."""
 
 PAUSE_S: Final = 0.05
-"""Pause before a shard is asked again that could not do it yet."""
+"""Pause before a busy shard is asked again."""
 
 _log = logging.getLogger("enact")
 
 
 def fork_world(session: Session, source: str, name: str, *, at_ns: int = 0) -> None:
     """Make world context `name` a fork of `source` on every shard; see `WorldContext.fork`."""
-    try:
-        checked_name("world context", name, slashes=False)
-    except ValueError as error:
-        raise MisuseError(str(error)) from None
+    checked_as("world context", name)
     client = session.client
     session.check_world(source)
     there = client.worlds_at(name)
@@ -79,10 +70,12 @@ def fork_world(session: Session, source: str, name: str, *, at_ns: int = 0) -> N
         latest = max(forgotten, key=lambda each: each.oldest_ns, default=None)
         for answer in answers.values():
             if isinstance(answer, Refused) and _is_busy(answer):
-                refusal = answer.text  # an undecided commit stands in the way: ask again
+                refusal = answer.text  # an undecided commit blocks it: ask again
             elif answer is not None and not isinstance(answer, Forked):
                 _take_back(session, name, [shard for shard in done if shard not in there])
-                raise _failure(latest or answer)
+                if latest is not None:
+                    raise error_of(latest)
+                expected(Forked, Fork, answer)
         left = [shard for shard in left if shard not in done]
         if left:
             client.rest(PAUSE_S)
@@ -98,7 +91,7 @@ def _learn_worlds(session: Session) -> None:
 
 
 def _refuse_existing(name: str, there: Mapping[str, WorldEntry]) -> None:
-    """Raise if some shard has a world context of that name that is not the fork which is wanted."""
+    """Raise if a shard has a world context of that name that is not the wanted fork."""
     for shard, (_, source, at_ns) in there.items():
         what = f"a fork of {source!r} as of {moment_name(at_ns)}" if source else "no fork"
         remedy = f"take another name, or drop it: enact world drop {name}, or cell.drop_world(…)"
@@ -110,14 +103,8 @@ def _refuse_existing(name: str, there: Mapping[str, WorldEntry]) -> None:
         raise MisuseError(f"there is a world context {name!r} on shard {shard}, {what}; {remedy}")
 
 
-def _failure(answer: Answer) -> EnactError:
-    if isinstance(answer, Refused | Forgotten):
-        return error_of(answer)
-    return ProtocolError(f"{type(answer).__name__} came as the answer to Fork")
-
-
 def _take_back(session: Session, name: str, shards: list[str]) -> None:
-    """Drop a fork on shards that have just made it; elsewhere it may be another client's."""
+    """Drop a fork on the shards that have just made it; others may have it from another client."""
     for shard, answer in _dropped(session, name, shards, timeout_s=UNDO_S).items():
         if not isinstance(answer, Dropped):
             _log.warning("shard %s may have a part of the fork %s: drop it", shard, name)
@@ -151,11 +138,11 @@ def drop_world(session: Session, name: str) -> int:
     _refuse_locked(session, name)
     answers = _dropped(session, name, client.shards(), timeout_s=FINISH_S)
     _learn_worlds(session)
-    done = [shard for shard, answer in answers.items() if isinstance(answer, Dropped)]
+    done = {shard: each.slots for shard, each in answers.items() if isinstance(each, Dropped)}
     for shard, answer in answers.items():
-        if not isinstance(answer, Dropped):
-            raise _not_dropped(session, name, done, shard, answer)
-    return sum(answer.slots for answer in answers.values() if isinstance(answer, Dropped))
+        if shard not in done:
+            raise _not_dropped(session, name, list(done), shard, answer)
+    return sum(done.values())
 
 
 def _dropped(
@@ -178,15 +165,14 @@ def _dropped(
 
 
 def _is_busy(answer: Answer | None) -> bool:
-    """Whether a shard cannot do now what it may do if it is asked again."""
+    """Whether a shard cannot do it now but may do it if it is asked again."""
     return isinstance(answer, Refused) and answer.code == OVERLOAD
 
 
 def _refuse_locked(session: Session, name: str) -> None:
-    """Raise while anything of a context is locked, before one shard has dropped it."""
-    client = session.client
-    for answer in client.call_all([(shard, ListLocks()) for shard in client.shards()]):
-        for holder in answer.holders if isinstance(answer, Locks) else ():
+    """Raise while a slot of a context is locked, before any shard has dropped it."""
+    for _, answer in ask_all(session.client, Locks, ListLocks()):
+        for holder in answer.holders:
             if any(slot.startswith(f"{name}:") for slot in holder.slots):
                 raise MisuseError(
                     f"world context {name!r} is not dropped: {holder_line(holder)}; end that lock"
@@ -203,14 +189,14 @@ def _not_dropped(
     if done:
         state = f"world context {name!r} is dropped on {', '.join(done)}, but not on {shard}"
         remedy = (
-            f"; it is no world context any more, and what {shard} has left of it goes when"
-            f" enact world drop {name}, or cell.drop_world({name!r}), is called again"
+            f"; it is no world context any more; to delete what {shard} still has of it, call"
+            f" enact world drop {name}, or cell.drop_world({name!r}), again"
         )
     if isinstance(answer, Refused):
         found = error_of(answer)
         return type(found)(f"{state}: {found}{remedy}") if done else found
     if answer is not None:
-        return ProtocolError(f"{type(answer).__name__} came as the answer to DropWorld")
+        expected(Dropped, DropWorld, answer)
     return ShardUnreachableError(
         f"{state}: no answer came for {FINISH_S:g} s{remedy}",
         shard=shard,

@@ -1,10 +1,10 @@
-"""Where a datum comes from and what came of it: trees of commits, as far as they are remembered.
+"""Where a datum comes from and what was made from it: trees of commits, as far as they are known.
 
 Each version knows the commit that made it and the versions that its lock had read
-(`access.writes`). Followed back these are its causes (`Cell.why`), followed on its effects
-(`Cell.impact`), over all shards and world contexts.  A cause is remembered as long as the version
-that it made: versions beyond retention appear in a tree of causes as "forgotten", by name;
-forgotten effects cannot be found.
+(`access.writes`).  `Cell.why` follows these back to the causes, `Cell.impact` forward to the
+effects, over all shards and world contexts.  A cause is known as long as the version that it made:
+versions beyond retention appear in a tree of causes as "forgotten"; forgotten effects cannot be
+found.
 """
 
 from __future__ import annotations
@@ -12,26 +12,27 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
 
-from enact_dist.access.asking import versions_in
+from enact_dist.access.arguments import checked_as
+from enact_dist.access.asking import answers_to, explained, in_parts, listed
+from enact_dist.access.snapshot import reason_of
 from enact_dist.core.protocol.datum import LockId, Position, Slot
 from enact_dist.core.protocol.messages import (
     Cause,
     DatumRead,
-    Explain,
     FindEffects,
-    ListHistory,
     SlotVersion,
+    Versions,
 )
 from enact_dist.errors import ForgottenError, MisuseError, NullDatumError
-from enact_dist.terms import Entity, NullReason, checked_name
+from enact_dist.terms import Entity, NullReason
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from enact_dist.access.session import Session
-    from enact_dist.core.protocol.messages import Request, SlotState, VersionEntry
+    from enact_dist.core.protocol.messages import VersionEntry
     from enact_dist.link.client.locks import CellClient
     from enact_dist.terms import Aspect, Context
 
@@ -44,8 +45,6 @@ NULL: Final = "null"
 
 DEPTH_MAX: Final = 200
 """Most steps of one tree: a recursive walk stays within Python's recursion limit."""
-ASKED_MAX: Final = 256
-"""So many data are asked about by one question; each may name a thousand others."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -59,19 +58,21 @@ class Made:
         version: Its number.
         position: Position of its commit.
         age_s: How long ago that was, by the shards' clock.
-        kind: "commit" or "fork"; else why no more is known of it: "forgotten" (it has left its
-            retention), "unknown" (it is there without its cause) or "null" (it was read where
-            there was no datum yet, or none any more after its volatile shard had restarted).
+        kind: "commit" or "fork"; otherwise why its cause is not known: "forgotten" (the version
+            has left its retention), "unknown" (the version is there, its cause is not) or "null"
+            (a lock read the slot while there was no datum yet, or none any more because its
+            volatile shard had restarted).
         actor: Who committed it; the empty string if it has no name.
         host: Host of that client.
         pid: Process of that client.
         stamp_ns: When the datum was captured, according to the actor (0: unknown).
         held_s: How long the lock had been held when it committed.
         null_reason: Why the version is null; the empty string for a datum.
-        left_out: How many further data its lock had read than a commit names.
-        elsewhere: Whether it stands in the tree a second time, nearer to the root or before; what
-            follows it is shown there.
+        left_out: How many data its lock had read beyond those that the commit names.
+        elsewhere: Whether the tree has it a second time, nearer to the root or before; its children
+            are shown there.
         unfollowed: How many versions come next that were not followed, because of the depth.
+        children: The versions that come next.
     """
 
     world: str
@@ -90,10 +91,18 @@ class Made:
     left_out: int = 0
     elsewhere: bool = False
     unfollowed: int = 0
+    children: tuple[Any, ...] = ()  # of its own class
+
+    def walk(self) -> Iterator[Self]:
+        """Yield this version and all that follow it in the tree, each once."""
+        yield self
+        for child in self.children:
+            if not child.elsewhere:
+                yield from child.walk()
 
     @property
     def known(self) -> bool:
-        """Whether the version is still there, so that it can be kept."""
+        """Whether the version is still there, so that it can be pinned."""
         return self.kind not in {FORGOTTEN, NULL}
 
     @property
@@ -107,78 +116,49 @@ class Made:
 
 @dataclass(frozen=True, slots=True, repr=False)
 class CauseTree(Made):
-    """A version with those that its lock had read when it was committed, and their causes.
-
-    Attributes:
-        children: What it was made of, by name.
-    """
+    """A version and its causes: `children` are the versions that its lock had read, by name."""
 
     children: tuple[CauseTree, ...] = ()
-
-    def walk(self) -> Iterator[CauseTree]:
-        """Yield this version and all that led to it, each once."""
-        return _walk(self)
 
 
 @dataclass(frozen=True, slots=True, repr=False)
 class EffectTree(Made):
-    """A version with those whose locks had read it when they were committed, and their effects.
-
-    Attributes:
-        children: What it went into, the oldest first.
-    """
+    """A version and its effects: `children` are those whose locks had read it, oldest first."""
 
     children: tuple[EffectTree, ...] = ()
 
-    def walk(self) -> Iterator[EffectTree]:
-        """Yield this version and all that came of it, each once."""
-        return _walk(self)
-
 
 Tree = TypeVar("Tree", CauseTree, EffectTree)
-Part = TypeVar("Part")
-_NOBODY: Final = Cause(LockId("", 0, 0), "", "", "", 0, 0, 0, (), 0, ())
+_NO_CAUSE: Final = Cause(LockId("", 0, 0), "", "", "", 0, 0, 0, (), 0, ())
 
 
-def _walk(tree: Tree) -> Iterator[Tree]:
-    yield tree
-    for child in tree.children:
-        if not child.elsewhere:
-            yield from _walk(child)
-
-
-def causes_of(session: Session, named: Named, version: int, depth: int | None) -> CauseTree:
-    """Return where a version comes from; see `Cell.why`."""
+def tree_of(
+    kind: type[Tree], session: Session, named: Named, version: int, depth: int | None
+) -> Tree:
+    """Return the causes or the effects of a version; see `Cell.why` and `Cell.impact`."""
     search = _Search(session.client)
-    start = search.start(_slot_of(session, *named), version)
-    return _grown(CauseTree, search, start, search.causes, depth)
-
-
-def effects_of(session: Session, named: Named, version: int, depth: int | None) -> EffectTree:
-    """Return what came of a version; see `Cell.impact`."""
-    search = _Search(session.client)
-    start = search.start(_slot_of(session, *named), version)
-    return _grown(EffectTree, search, start, search.effects, depth)
+    root = search.start(_slot_of(session, *named), version)
+    follow = search.causes if kind is CauseTree else search.effects
+    return _grown(kind, search, root, follow, depth)
 
 
 def _slot_of(
     session: Session, world: Context | str, entity: Entity | str, aspect: Aspect[Any] | str
 ) -> Slot:
-    """Return the slot that is named; its world context is there."""
+    """Return the slot that is named, in a world context that the cell has."""
     session.client.check_usable()
     name = world if isinstance(world, str) else world.name
     if not isinstance(world, str) and getattr(world, "session", None) is not session:
         raise MisuseError(f"{world!r} is not a world context of this cell through this connection")
     if not isinstance(world, str) and world.past:
-        raise MisuseError(f"{world!r} is as it was; name {name!r} and a version of its history")
+        raise MisuseError(f"{world!r} is past; name {name!r} and a version of its history")
     if name not in session.client.worlds():
         session.check_world(name)
-    try:
-        return Slot(
-            name, Entity(str(entity)).name, checked_name("aspect", str(aspect), slashes=False)
-        )
-    except ValueError as error:
-        raise MisuseError(str(error)) from None
+    return Slot(
+        name,
+        checked_as("entity", str(entity), slashes=True),
+        checked_as("aspect", str(aspect)),
+    )
 
 
 def _grown(
@@ -192,7 +172,7 @@ def _grown(
 
     Args:
         kind: Which tree.
-        search: Says what is known of a version.
+        search: What is known of each version.
         root: Where it begins.
         follow: Returns what comes next of each of some versions, with one question to each shard.
         depth: How many steps to follow; None: `DEPTH_MAX`.
@@ -245,10 +225,11 @@ class _Search:
             MisuseError: There was no such version yet.
         """
         asked = dict.fromkeys((SlotVersion(slot, 0), SlotVersion(slot, version)))
-        entries = self._explained(asked)
-        newest = max((entry.state for entry in entries), key=_version_of, default=None)
+        entries = self._entries(explained(self._client, asked))
+        states = (entry.state for entry in entries)
+        newest = max(states, key=lambda state: state.version, default=None)
         if newest is None or not newest.version:
-            reason = NullReason[(newest and newest.null_reason) or "NEVER_SET"].value
+            reason = (newest and reason_of(newest)) or NullReason.NEVER_SET.value
             raise NullDatumError(f"{slot} is null ({reason}): nothing led to it", reason=reason)
         wanted = version or newest.version
         for entry in entries:
@@ -257,12 +238,11 @@ class _Search:
                 return _read_of(entry)
         if not 0 < version < newest.version:
             raise MisuseError(f"{slot} has no version {version}; the newest is {newest.version}")
-        history = ListHistory((slot.context,), (slot.entity,), (slot.aspect,))
-        answer = versions_in(self._client.call(self._client.shard_of(slot.entity), history))
-        oldest = answer.entries[0].state if answer.entries else newest
+        left = listed(self._client, self._client.shard_of(slot.entity), slot)
+        oldest = left[0].state if left else newest
         raise ForgottenError(
             f"version {version} of {slot} has left its retention; the oldest that is known is"
-            f" {oldest.version} (a larger retention, or cell.keep, keeps more)",
+            f" {oldest.version} (a larger retention, or cell.pin, keeps more)",
             oldest_ns=oldest.stamp_ns,
         )
 
@@ -270,7 +250,7 @@ class _Search:
         """Return what each of these versions was made of."""
         unknown = {one: None for one in level if one not in self._known}
         asked = [SlotVersion(one.slot, one.version) for one in unknown if one.version]
-        for entry in self._explained(asked):
+        for entry in self._entries(explained(self._client, asked)):
             if _read_of(entry) in unknown:  # otherwise the number belongs to another, newer version
                 self._known[_read_of(entry)] = entry
         for one in level:
@@ -279,16 +259,15 @@ class _Search:
 
     def _cause(self, one: DatumRead) -> Cause:
         entry = self._known.get(one)
-        return entry.cause if entry is not None and entry.cause is not None else _NOBODY
+        return entry.cause if entry is not None and entry.cause is not None else _NO_CAUSE
 
     def effects(self, level: Sequence[DatumRead]) -> dict[DatumRead, Sequence[DatumRead]]:
-        """Return what each of these versions went into."""
+        """Return what was made from each of these versions."""
         found: dict[DatumRead, dict[DatumRead, None]] = {one: {} for one in level}
         shards = self._client.shards()
-        calls = [
-            (shard, FindEffects(some)) for shard in shards for some in _in_parts(level, ASKED_MAX)
-        ]
-        for entry in self._asked(calls):
+        calls = [(shard, FindEffects(some)) for shard in shards for some in in_parts(level)]
+        answers = (answer for _, answer in answers_to(self._client, Versions, calls))
+        for entry in self._entries(answers):
             made = _read_of(entry)
             self._known[made] = entry
             for read in self._cause(made).reads:
@@ -296,21 +275,9 @@ class _Search:
                     found[read][made] = None
         return {one: sorted(made, key=_as_made) for one, made in found.items()}
 
-    def _explained(self, versions: Iterable[SlotVersion]) -> list[VersionEntry]:
-        by_shard: dict[str, list[SlotVersion]] = {}
-        for version in versions:
-            by_shard.setdefault(self._client.shard_of(version.slot.entity), []).append(version)
-        return self._asked(
-            [
-                (shard, Explain(some))
-                for shard, wanted in by_shard.items()
-                for some in _in_parts(wanted, ASKED_MAX)
-            ]
-        )
-
-    def _asked(self, calls: Sequence[tuple[str, Request]]) -> list[VersionEntry]:
+    def _entries(self, answers: Iterable[Versions]) -> list[VersionEntry]:
         entries: list[VersionEntry] = []
-        for answer in map(versions_in, self._client.call_all(calls)):
+        for answer in answers:
             self._now_ns = max(self._now_ns, answer.stamp_ns)
             entries += answer.entries
         return entries
@@ -327,7 +294,6 @@ class _Search:
         """Return a version as a part of a tree."""
         slot, version, stamp_ns = one
         entry, cause = self._known.get(one), self._cause(one)
-        reason = entry.state.null_reason if entry is not None else ""
         nothing = NULL if not version else FORGOTTEN if entry is None else UNKNOWN
         return kind(
             world=slot.context,
@@ -342,7 +308,7 @@ class _Search:
             pid=cause.pid,
             stamp_ns=entry.state.captured_ns if entry is not None else 0,
             held_s=cause.held_ns / 1e9,
-            null_reason=NullReason[reason].value if reason else "",
+            null_reason=reason_of(entry.state) if entry is not None else "",
             left_out=self._left_out.get(one, 0),
             elsewhere=elsewhere,
             unfollowed=unfollowed,
@@ -352,15 +318,6 @@ class _Search:
 
 def _read_of(entry: VersionEntry) -> DatumRead:
     return DatumRead(*entry.state[:3])
-
-
-def _version_of(state: SlotState) -> int:
-    return state.version
-
-
-def _in_parts(all_of_them: Sequence[Part], most: int) -> Iterator[tuple[Part, ...]]:
-    for start in range(0, len(all_of_them), most):
-        yield tuple(all_of_them[start : start + most])
 
 
 def _as_read(by: DatumRead, read: DatumRead) -> tuple[object, ...]:

@@ -1,4 +1,4 @@
-"""What a cell tells people about its slots, locks, shards, actors and operators."""
+"""Listings of a cell for people: its aspects, locks, shards, actors and acts of operators."""
 
 from __future__ import annotations
 
@@ -6,20 +6,17 @@ import time
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final
 
-from enact_dist.core.protocol.datum import Position
+from enact_dist.access.asking import answers_to, ask_all
 from enact_dist.core.protocol.messages import (
+    NO_LIMIT,
     ListSessions,
-    Refused,
     Sessions,
     Survey,
     Surveyed,
     Welcome,
 )
-from enact_dist.core.protocol.parts import NO_LIMIT
 from enact_dist.core.state.retention import limits_of
-from enact_dist.errors import LinkError, ProtocolError
-from enact_dist.link.refusals import error_of
-from enact_dist.terms import Entity, NullReason
+from enact_dist.errors import LinkError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -31,30 +28,30 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class AspectInfo:
-    """One aspect as some shards know it, all of them in the same way.
+    """One aspect, as some shards know it in the same way.
 
     Attributes:
         aspect: Its name.
-        type: The fingerprint of its type; "" where no type is registered, though there are slots.
-            A ``=`` marks fields that have a default.
-        durability: What its data survive, "" as well.
-        versions: So many of each slot are retained, the newest one included; None: without limit.
-        age_s: For so long after they were replaced; None likewise.
-        history_bytes: So many bytes of replaced ones; None likewise.
-        shards: Those that know it so.
-        slots: How many there are on these shards, null ones too.
+        type: The fingerprint of its type; "" if there are slots but no type is registered.  A ``=``
+            marks fields that have a default.
+        durability: What its data survive; "" if no type is registered.
+        versions: How many versions of each slot are retained, the newest included; None: no limit.
+        age_s: How long a version is retained after it was replaced; None: no limit.
+        history_bytes: How many bytes of replaced data are retained; None: no limit.
+        shards: The shards that know it so.
+        slots: How many slots it has on these shards, null ones included.
         data: How many of these are not null.
-        size_bytes: Of the newest data, each counted as in `SlotInfo`.
+        size_bytes: Size of the newest data, each counted as in `SlotInfo`.
         older_types: The fingerprints of the types that this one has succeeded, the oldest first.
     """
 
     aspect: str
-    type: str
-    durability: str
-    versions: int | None
-    age_s: float | None
-    history_bytes: int | None
-    shards: tuple[str, ...]
+    type: str = ""
+    durability: str = ""
+    versions: int | None = None
+    age_s: float | None = None
+    history_bytes: int | None = None
+    shards: tuple[str, ...] = ()
     slots: int = 0
     data: int = 0
     size_bytes: int = 0
@@ -62,7 +59,7 @@ class AspectInfo:
 
 
 def aspect_infos(session: Session, world: str = "") -> tuple[AspectInfo, ...]:
-    """Return the aspects of all shards; one that shards know differently comes once for each way.
+    """Return the aspects of all shards; if shards know one differently, one entry for each way.
 
     Args:
         session: The session that asks.
@@ -72,58 +69,37 @@ def aspect_infos(session: Session, world: str = "") -> tuple[AspectInfo, ...]:
         ShardUnreachableError: A shard does not answer.
     """
     client = session.client
-    shards = client.shards()
-    request = Survey((world,) if world else (), (), ())
-    answers = client.call_all([(shard, client.core.hello(shard)) for shard in shards])
-    surveys = client.call_all([(shard, request) for shard in shards])
+    hellos = [(shard, client.core.hello(shard)) for shard in client.shards()]
+    welcomes = answers_to(client, Welcome, hellos)
+    surveys = ask_all(client, Surveyed, Survey((world,) if world else (), (), ()))
     found: dict[AspectInfo, AspectInfo] = {}
-    for shard, answer, survey in zip(shards, answers, surveys, strict=True):
-        for info in _of_shard(answer, survey):
-            known_as = replace(info, slots=0, data=0, size_bytes=0)
-            before = found.get(known_as, known_as)
-            found[known_as] = replace(
+    for (shard, welcome), (_, survey) in zip(welcomes, surveys, strict=True):
+        infos = {entry.name: _info(entry) for entry in welcome.aspects}
+        states: dict[str, list[SlotState]] = {name: [] for name in infos}
+        for state in survey.states:
+            states.setdefault(state.slot.aspect, []).append(state)
+        for name, some in states.items():
+            info = infos.get(name) or AspectInfo(name)
+            before = found.get(info, info)
+            found[info] = replace(
                 info,
                 shards=(*before.shards, shard),
-                slots=before.slots + info.slots,
-                data=before.data + info.data,
-                size_bytes=before.size_bytes + info.size_bytes,
+                slots=before.slots + len(some),
+                data=before.data + sum(not state.null_reason for state in some),
+                size_bytes=before.size_bytes + sum(state.size for state in some),
             )
     return tuple(sorted(found.values(), key=lambda info: (info.aspect, info.shards)))
 
 
-def _of_shard(answer: Answer, survey: Answer) -> list[AspectInfo]:
-    if isinstance(answer, Refused):
-        raise error_of(answer)
-    if not isinstance(answer, Welcome) or not isinstance(survey, Surveyed):
-        came = f"{type(answer).__name__} and {type(survey).__name__}"
-        raise ProtocolError(f"{came} came as the answers to Hello and Survey")
-    infos = {entry.name: _info(entry) for entry in answer.aspects}
-    states: dict[str, list[SlotState]] = {name: [] for name in infos}
-    for state in survey.states:
-        states.setdefault(state.slot.aspect, []).append(state)
-    nobody = AspectInfo("", "", "", None, None, None, ())
-    return [
-        replace(
-            infos.get(name, replace(nobody, aspect=name)),
-            slots=len(some),
-            data=sum(1 for state in some if not state.null_reason),
-            size_bytes=sum(state.size for state in some),
-        )
-        for name, some in states.items()
-    ]
-
-
 def _info(entry: AspectEntry) -> AspectInfo:
     versions, age_ns, size = (None if one == NO_LIMIT else one for one in limits_of(entry))
-    age_s = None if age_ns is None else age_ns / 1e9
     return AspectInfo(
         entry.name,
         entry.fingerprint,
         entry.durability,
         versions,
-        age_s,
+        None if age_ns is None else age_ns / 1e9,
         size,
-        (),
         older_types=entry.older,
     )
 
@@ -139,7 +115,7 @@ class LockInfo:
     Attributes:
         number: What `Cell.break_lock` takes; unique within the shard's epoch.
         modes: "read", "write" or both.
-        waits_for: Numbers of the locks in the way.
+        waits_for: Numbers of the locks that block it.
     """
 
     shard: str
@@ -162,15 +138,15 @@ class ShardInfo:
     """One shard of the cell; `reachable` False leaves everything else at zero.
 
     Attributes:
-        reachable: Whether it answers, and this process may use the way to it.
+        reachable: Whether it answers, over a carrier that this process may use.
         open: Whether it grants locks; False while it waits for older leases to end after a start,
             and while it ends.
-        size_bytes: Of the newest data, each counted as in `SlotInfo`.
-        clock_ahead_s: Its wall clock less ours, half a round trip taken off.
-        round_trip_s: Of the call that asked.
-        carrier: How this process's calls to it travel: "socket", or "zenoh" and why.
+        size_bytes: Size of the newest data, each counted as in `SlotInfo`.
+        clock_ahead_s: How far its wall clock is ahead of ours, corrected by half a round trip.
+        round_trip_s: Duration of the call that asked.
+        carrier: How this process reaches it: "socket", or "zenoh" and why.
         counters: Its statistics by name.
-        problem: Why it is not reachable, empty where it just does not answer.
+        problem: Why it is not reachable; empty if it just does not answer.
     """
 
     name: str
@@ -197,7 +173,7 @@ class ActorInfo:
     Attributes:
         lease_left_s: Below 0: time since its lease expired without contact to a shard.
         report: The actor's own statistics; empty if it sends none.
-        namesakes: Further sessions, none of them silent, with an actor of the same name.
+        namesakes: Other sessions, none of them silent, with an actor of the same name.
     """
 
     actor: str
@@ -225,14 +201,14 @@ class ActorInfo:
 
 @dataclass(frozen=True, slots=True)
 class AuditInfo:
-    """An act of an operator at a shard, or what came of one.
+    """An act of an operator at a shard, or its outcome.
 
     Attributes:
         stamp_s: When, by the shard's wall clock, seconds since 1970.
-        kind: "broken" or "forced" (the action), "confirmed" or "alarm" (the answer of a lost shard
+        kind: "broken" or "forced" (the act), "confirmed" or "alarm" (the answer of a lost shard
             once it was back), "settled" (an operator has settled all earlier alarms).
         text: Who or what, and the reason that was given.
-        identity: Requester, as actor@host:pid; empty for the shard's own findings.
+        identity: Who asked for it, as actor@host:pid; empty for the shard's own findings.
     """
 
     shard: str
@@ -242,43 +218,10 @@ class AuditInfo:
     identity: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class SlotInfo:
-    """One slot of a world context, without its datum.
-
-    Attributes:
-        size_bytes: Length of the datum's body: arrays, texts and bytes over 256 B, long lists; 0
-            for all else.
-        null_reason: Why it is null, or the empty string.
-        shard: Where it lies.
-    """
-
-    entity: Entity
-    aspect: str
-    version: int
-    position: Position
-    size_bytes: int
-    null_reason: str
-    shard: str
-
-
-def slot_info(shard: str, state: SlotState) -> SlotInfo:
-    """Return a shard's description of a slot."""
-    return SlotInfo(
-        Entity(state.slot.entity),
-        state.slot.aspect,
-        state.version,
-        Position(state.stamp_ns, shard),
-        state.size,
-        NullReason[state.null_reason].value if state.null_reason else "",
-        shard,
-    )
-
-
-def actor_infos(told: Iterable[tuple[str, Answer | None]]) -> tuple[ActorInfo, ...]:
+def actor_infos(answers: Iterable[tuple[str, Answer | None]]) -> tuple[ActorInfo, ...]:
     """Return the sessions of named actors, from the answers of all shards that answered."""
     found: dict[str, ActorInfo] = {}
-    for shard, answer in told:
+    for shard, answer in answers:
         for info in answer.sessions if isinstance(answer, Sessions) else ():
             if not info.actor:
                 continue
@@ -340,7 +283,7 @@ def lock_info(shard: str, holder: Holder) -> LockInfo:
 
 
 def shard_info(client: CellClient, shard: str) -> ShardInfo:
-    """Return what is known of a shard.  A shard that fails does not affect the others' results."""
+    """Return what is known of a shard; one that cannot be asked is described with why."""
     try:
         return _asked_info(client, shard)
     except LinkError as error:
@@ -352,7 +295,7 @@ def _asked_info(client: CellClient, shard: str) -> ShardInfo:
     question = (shard, ListSessions())
     endpoint = client.carrier.endpoint_of(shard)
     if client.core.needs_hello(shard):
-        # How calls travel is known from its welcome on.  Who is silent is waited for once.
+        # Its welcome names the carrier of later calls.  A silent shard is waited for only once.
         hello = (shard, client.core.hello(shard))
         if client.call_once([hello, question])[1] is None:
             return ShardInfo(shard, endpoint, reachable=False)

@@ -1,4 +1,6 @@
-"""A world context as it was: what `WorldContext.at` returns.
+"""World contexts of a cell: what present and past ones have in common, and the past ones.
+
+`WorldContext.at` returns a past one.
 
 ::
 
@@ -18,25 +20,110 @@ from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 
 from enact_dist.access.arguments import check_pattern, checked_each
 from enact_dist.access.lock import refuse_inside_lock
-from enact_dist.access.snapshot import raw_datum, survey_states, take_readings, take_snapshot
+from enact_dist.access.snapshot import (
+    slot_info,
+    slot_states,
+    take_readings,
+    take_snapshot,
+    untyped_datum,
+)
 from enact_dist.core.protocol.messages import Item
 from enact_dist.errors import MisuseError
 from enact_dist.link.refusals import moment_name
 from enact_dist.terms import Access, Context, Entities, Entity
-from enact_dist.world.listings import SlotInfo, slot_info
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from enact_dist.access.arguments import Moment
     from enact_dist.access.session import Session
-    from enact_dist.access.snapshot import Snapshot
+    from enact_dist.access.snapshot import SlotInfo, Snapshot
     from enact_dist.compare.diff import Diff
     from enact_dist.compare.two_worlds import Viewable
+    from enact_dist.core.protocol.messages import SlotState
     from enact_dist.terms import Aspect, LockRequest
 
 
-class PastContext(Context):
+class CellContext(Context):
+    """A world context of a cell, present or past: its slots, data without a type, differences."""
+
+    __slots__ = ("session",)
+
+    def __init__(self, name: str, session: Session) -> None:
+        super().__init__(name)
+        self.session = session
+
+    def list_slots(
+        self, entities: Entities | str = "**", aspects: tuple[str, ...] = ()
+    ) -> tuple[SlotInfo, ...]:
+        """List the slots that match, without their data.
+
+        Of a present context null slots are listed, too; of a past one they are left out.
+
+        Raises:
+            ForgottenError: A past state has left its retention.
+            UnknownWorldError: The cell does not have this world context any more.
+            ShardUnreachableError: A shard does not answer.
+        """
+        check_pattern("list_slots(entities, aspects)", "entities", entities)
+        names = checked_each("list_slots(entities, aspects)", "aspects", aspects, str)
+        states = self._states(str(Entities(str(entities))), names)
+        infos = [slot_info(shard, state) for shard, state in states]
+        return tuple(sorted(infos, key=lambda info: (info.entity, info.aspect)))
+
+    def _states(self, pattern: str, aspects: tuple[str, ...]) -> Iterable[tuple[str, SlotState]]:
+        return slot_states(self.session, self.name, pattern, aspects)
+
+    def entities(self, pattern: Entities | str = "**") -> tuple[Entity, ...]:
+        """Return the entities that have some datum here; raises as `list_slots`."""
+        infos = self.list_slots(pattern)
+        return tuple(sorted({info.entity for info in infos if not info.null_reason}))
+
+    def get_untyped(self, entity: Entity, aspect: str) -> object:
+        """Return a datum without knowing its Python type: dataclasses come as dicts.
+
+        Raises:
+            NullDatumError: It is null.
+            ForgottenError: A past datum has left its retention.
+            MisuseError: No such aspect is registered.
+        """
+        return untyped_datum(self, self.session, entity, aspect)
+
+    def diff(
+        self,
+        other: Viewable,
+        entities: Entities | Entity | str = "**",
+        aspects: Iterable[Aspect[Any] | str] | None = None,
+    ) -> Diff:
+        """Compare this world context (left) with another one (right), datum by datum.
+
+        Both are read in one consistent snapshot, a past one as of its moment.  Data are compared by
+        the comparator of their aspect, exactly if it has none.  If the type of an aspect is not
+        known in this process, its data are compared without it, dataclasses as dicts.  Data that
+        are one version on both sides are not fetched.
+
+        Args:
+            other: A present or past world context.  If it is of another cell, it is read in a
+                snapshot of its own.
+            entities: A pattern or one entity.
+            aspects: Aspects, or their names; None means all.
+
+        Raises:
+            LockHeldError: This thread holds a lock.
+            ForgottenError: A past context is beyond retention.
+            TypeError: An argument is of another type.
+            MisuseError: No program has registered one of the named aspects.
+            UnknownWorldError: The cell no longer has one of them.
+            DatumTypeError: An aspect is registered with another type.
+            ShardUnreachableError: A shard does not answer.
+        """
+        from enact_dist.compare.diff import diff
+
+        refuse_inside_lock("diff")
+        return diff(self, other, entities, aspects)
+
+
+class PastContext(CellContext):
     """A world context as of a moment, read-only; made by `WorldContext.at`.
 
     Requests name it as they do a world context: ``View(past, entity, ASPECT)``.  All views of one
@@ -46,22 +133,21 @@ class PastContext(Context):
         moment: What is shown.
     """
 
-    __slots__ = ("moment", "session")
+    __slots__ = ("moment",)
     past: ClassVar[bool] = True
 
     def __init__(self, name: str, session: Session, moment: Moment) -> None:
-        super().__init__(name)
-        self.session = session
+        super().__init__(name, session)
         self.moment = moment
 
     @property
     def at_ns(self) -> int:
-        """The timestamp that it shows; 0: data are shown by their capture timestamp."""
+        """The timestamp that it shows; 0: data are shown by their capture stamps."""
         return self.moment.at_ns
 
     @property
     def stamp_ns(self) -> int:
-        """The capture stamp of the data that are shown, 0 where it does not matter."""
+        """The capture stamp of the data that are shown; 0: data are shown by their commits."""
         return self.moment.captured_ns
 
     def view(self, *requests: LockRequest[Any]) -> Snapshot:
@@ -71,10 +157,11 @@ class PastContext(Context):
             requests: `View`s and `ViewEach`es of this moment.
 
         Raises:
-            ForgottenError: A state of then has left its retention; never shown as another one.
+            ForgottenError: A state of that moment has left its retention; it is never shown as
+                another one.
             MisuseError: A request locks, or names another moment.
             ClockSkewError: The moment lies in the future of a shard's clock.
-            LockTimeoutError: A commit stamped before stays undecided.
+            LockTimeoutError: A commit with an earlier timestamp stays undecided.
             ShardUnreachableError: A shard does not answer.
         """
         for request in requests:
@@ -85,63 +172,22 @@ class PastContext(Context):
                 )
         return take_snapshot(requests)
 
-    def survey(
-        self, entities: Entities | str = "**", aspects: tuple[str, ...] = ()
-    ) -> tuple[SlotInfo, ...]:
-        """List the data that matched then, without them; what was null is left out.
-
-        Raises:
-            ForgottenError: A state of then has left its retention.
-            UnknownWorldError: The cell has no such world context any more.
-            ShardUnreachableError: A shard does not answer.
-        """
-        check_pattern("survey(entities, aspects)", "entities", entities)
-        aspects = checked_each("survey(entities, aspects)", "aspects", aspects, str)
-        client, pattern = self.session.client, str(Entities(str(entities)))
+    def _states(self, pattern: str, aspects: tuple[str, ...]) -> Iterable[tuple[str, SlotState]]:
+        client = self.session.client
         client.check_usable()
         client.greet()
         known = client.aspect_entries()
-        asked = [name for name in (aspects or known) if name in known]
+        asked = tuple(name for name in (aspects or known) if name in known)
         items = [Item(int(Access.VIEW_EACH), self.name, pattern, name) for name in asked]
         if self.stamp_ns:
             items = [
                 Item(int(Access.VIEW), *state.slot, 0, self.stamp_ns, self.moment.nearest)
-                for _, state in survey_states(self.session, self.name, pattern, tuple(asked))
+                for _, state in slot_states(self.session, self.name, pattern, asked)
             ]
-        readings = take_readings(self.session, items, past_ns=self.at_ns, data=False)
-        infos = [slot_info(shard, state) for shard, state in readings.shown()]
-        return tuple(sorted(infos, key=lambda info: (info.entity, info.aspect)))
-
-    def entities(self, pattern: Entities | str = "**") -> tuple[Entity, ...]:
-        """Return the entities that had some datum then; raises as `survey`."""
-        return tuple(sorted({info.entity for info in self.survey(pattern)}))
-
-    def raw(self, entity: Entity, aspect: str) -> object:
-        """Return a datum of then without knowing its Python type: dataclasses come as dicts.
-
-        Raises:
-            NullDatumError: It was null.
-            ForgottenError: It has left its retention.
-            MisuseError: No such aspect is registered.
-        """
-        return raw_datum(self, self.session, entity, aspect)
-
-    def diff(
-        self,
-        other: Viewable,
-        entities: Entities | Entity | str = "**",
-        aspects: Iterable[Aspect[Any] | str] | None = None,
-    ) -> Diff:
-        """Compare this world context as it was (left) with another one; as `WorldContext.diff`."""
-        from enact_dist.compare.diff import diff
-
-        refuse_inside_lock("diff")
-        return diff(self, other, entities, aspects)
-
-    # ---------------------------------------------------------------- what only the present has
+        return take_readings(self.session, items, past_ns=self.at_ns, data=False).shown()
 
     def init(self, *_: object) -> NoReturn:
-        """Refuse: what was cannot be set.
+        """Refuse: the past cannot be set.
 
         Raises:
             MisuseError: Always.
@@ -149,7 +195,7 @@ class PastContext(Context):
         self._refuse("init", f"set it in cell.world({self.name!r}), or in a fork of it: world.fork")
 
     def watch(self, *_: object) -> NoReturn:
-        """Refuse: what was does not change.
+        """Refuse: the past does not change.
 
         Raises:
             MisuseError: Always.

@@ -42,7 +42,7 @@ from enact_dist.terms import NullReason, ViewEach
 
 if TYPE_CHECKING:
     from enact_dist.world.cell import Cell
-    from enact_dist.world.history import Version
+    from enact_dist.world.context import Version
     from enact_dist.world.past import PastContext
 
 
@@ -149,7 +149,7 @@ class CellMachine(RuleBasedStateMachine):
             return
         late = None
         try:
-            self.cell.keep(label, asked.values())
+            self.cell.pin(label, asked.values())
         except ForgottenError as error:
             late = error
         known = [self.model.keep(label, *one) for one in asked]
@@ -160,7 +160,7 @@ class CellMachine(RuleBasedStateMachine):
     @rule(label=st.sampled_from(LABELS))
     def let_go(self, label):
         """Nobody wants them any more."""
-        self.cell.let_go(label)
+        self.cell.unpin(label)
         self.model.let_go(label)
         self._settle("labels let go")
 
@@ -210,7 +210,7 @@ class CellMachine(RuleBasedStateMachine):
         shown = {place[1]: one for place, one in expected.items() if isinstance(one, dict)}
         found = {entity.name: plain(datum) for entity, datum in snapshot[each].items()}
         assert found == {entity: state["value"] for entity, state in shown.items()}
-        surveyed = {info.entity.name: info.version for info in past.survey(aspects=(aspect,))}
+        surveyed = {info.entity.name: info.version for info in past.list_slots(aspects=(aspect,))}
         assert surveyed == {entity: state["version"] for entity, state in shown.items()}
         self.tally["travels by pattern"] += bool(found)
 
@@ -287,7 +287,7 @@ class CellMachine(RuleBasedStateMachine):
         assert set(self.cell.worlds()) == set(self.model.worlds)
         kept = {
             label: {(tuple(version.slot), version.version) for version in versions}
-            for label, versions in self.cell.kept().items()
+            for label, versions in self.cell.pinned().items()
         }
         assert kept == self.model.labels
         for world in self.model.worlds:
@@ -308,7 +308,7 @@ class CellMachine(RuleBasedStateMachine):
             assert version.stamp_ns == state["captured_ns"], version
             assert version.size_bytes == state["size"], version
             assert version.null_reason == _reason(state["reason"]), version
-            assert version.kept == self.model.kept(place, version.version), version
+            assert version.pinned == self.model.kept(place, version.version), version
             self._check_cause(version, state["cause"])
             if version.version:
                 self.listed.setdefault((place, version.version), version)

@@ -64,22 +64,22 @@ CALLS = {
         lambda world, _: world.watch_diff(world, PLAN),
         "watch_diff(other, entities, *aspects): entities is Aspect(",
     ),
-    "survey of one name": (
-        lambda world, _: world.survey("robot", "plan"),
-        "survey(entities, aspects): aspects is 'plan', which is no list of str",
+    "list_slots of one name": (
+        lambda world, _: world.list_slots("robot", "plan"),
+        "list_slots(entities, aspects): aspects is 'plan', which is no list of str",
     ),
-    "survey of aspects": (
-        lambda _, past: past.survey(Entities("*"), (PLAN,)),
-        "survey(entities, aspects): one of aspects is Aspect(",
+    "list_slots of aspects": (
+        lambda _, past: past.list_slots(Entities("*"), (PLAN,)),
+        "list_slots(entities, aspects): one of aspects is Aspect(",
         "which is no str",
     ),
-    "raw by names": (
-        lambda world, _: world.raw("robot", "plan"),
-        "raw(entity, aspect): entity is 'robot', which is no Entity; write Entity('robot')",
+    "get_untyped by names": (
+        lambda world, _: world.get_untyped("robot", "plan"),
+        "get_untyped(entity, aspect): entity is 'robot', which is no Entity; write Entity('robot')",
     ),
-    "raw of an aspect": (
-        lambda _, past: past.raw(robot, PLAN),
-        "raw(entity, aspect): aspect is Aspect(",
+    "get_untyped of an aspect": (
+        lambda _, past: past.get_untyped(robot, PLAN),
+        "get_untyped(entity, aspect): aspect is Aspect(",
         "which is no str",
     ),
     "view by names": (

@@ -297,5 +297,5 @@ def test_bytes_of_data_are_those_of_their_bodies(cell, datum_type, datum, least)
 
     found = after.size_bytes - before.size_bytes
     written = after.counters.get("bytes_written", 0) - before.counters.get("bytes_written", 0)
-    assert found == written == online.survey()[0].size_bytes
+    assert found == written == online.list_slots()[0].size_bytes
     assert (found >= least) if least else (found == 0)

@@ -48,7 +48,7 @@ def training(cell):
 @pytest.fixture
 def fetched(monkeypatch):
     """The slots whose data were asked for."""
-    from enact_dist.compare import two_worlds as sight
+    from enact_dist.access import snapshot
 
     asked = []
 
@@ -57,8 +57,8 @@ def fetched(monkeypatch):
         asked.extend(reading.state.slot for reading in readings)
         return fetch_all(client, cache, lock, readings, alive)
 
-    fetch_all = sight.fetch_all
-    monkeypatch.setattr(sight, "fetch_all", watched)
+    fetch_all = snapshot.fetch_all
+    monkeypatch.setattr(snapshot, "fetch_all", watched)
     return asked
 
 

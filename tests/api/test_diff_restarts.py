@@ -73,13 +73,13 @@ def test_watch_of_a_diff_outlives_a_restart(cell, restart):
 
 def test_diff_after_a_restart_takes_a_new_look(cell, restart, monkeypatch):
     """A shard that restarts between the cut and its data costs another cut, and no error."""
-    from enact_dist.compare import two_worlds as sight
+    from enact_dist.compare.two_worlds import SideView
 
     large = Aspect("large", np.ndarray)
     training, online = cell.world("training"), cell.world("online")
     for world, value in ((training, 0.0), (online, 3.0)):
         put(world, piece, large, np.full(100_000, value))
-    fetch, restarts = sight.Sight.fetch, []
+    fetch, restarts = SideView.fetch, []
 
     def fetch_late(self, readings):
         if not restarts:
@@ -88,7 +88,7 @@ def test_diff_after_a_restart_takes_a_new_look(cell, restart, monkeypatch):
             self.session.client.payloads.close()
         return fetch(self, readings)
 
-    monkeypatch.setattr(sight.Sight, "fetch", fetch_late)
+    monkeypatch.setattr(SideView, "fetch", fetch_late)
     (row,) = training.diff(online, aspects=[large])
     assert row.difference.distance == 3.0
     assert len(restarts) == 1

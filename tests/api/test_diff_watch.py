@@ -145,12 +145,12 @@ def test_error_loses_no_change(training, online, monkeypatch):
     from enact_dist.compare import watch_diff as diff_watch
 
     with training.watch_diff(online) as watch:
-        in_sight = diff_watch.both_in_sight
-        monkeypatch.setattr(diff_watch, "both_in_sight", lambda *_, **__: 1 / 0)
+        both_sides = diff_watch.both_sides
+        monkeypatch.setattr(diff_watch, "both_sides", lambda *_, **__: 1 / 0)
         put(online, piece, COUNT, 1)
         with pytest.raises(ZeroDivisionError):
             watch.next(SOON_S)
-        monkeypatch.setattr(diff_watch, "both_in_sight", in_sight)
+        monkeypatch.setattr(diff_watch, "both_sides", both_sides)
         assert told(watch, 0) == ("piece", "only right")
 
 

@@ -126,7 +126,7 @@ def test_dropped_context_is_unknown_to_whoever_holds_a_handle(cell, online):
     for use in (
         lambda: what_if.view(View(what_if, ARM, COUNT)),
         lambda: Lock(arm).__enter__(),
-        what_if.survey,
+        what_if.list_slots,
         lambda: what_if.init(ARM, COUNT, 1),
         lambda: what_if.fork("further"),
         lambda: cell.world("what_if"),

@@ -129,7 +129,7 @@ def test_kept_version_outlives_its_retention(cell, online, loose):
     """It is listed, readable and named under its label; let go of, it is forgotten."""
     put(online, ARM, 1, FLEETING)
     (first,) = online.history(ARM, FLEETING)
-    cell.keep("drop-17", [first])
+    cell.pin("drop-17", [first])
     for number in range(2, 6):
         put(online, ARM, number, FLEETING)
     loose.end()
@@ -137,37 +137,51 @@ def test_kept_version_outlives_its_retention(cell, online, loose):
 
     versions = online.history(ARM, FLEETING)
     assert [version.version for version in versions] == [1, 5, 6]
-    assert [version.kept for version in versions] == [("drop-17",), (), ()]
+    assert [version.pinned for version in versions] == [("drop-17",), (), ()]
     assert first.datum() == 1
-    kept = cell.kept()
+    kept = cell.pinned()
     assert [(version.slot, version.datum()) for version in kept["drop-17"]] == [(first.slot, 1)]
 
-    cell.let_go("drop-17")
+    cell.unpin("drop-17")
 
-    assert cell.kept() == {}
+    assert cell.pinned() == {}
     with pytest.raises(ForgottenError):
         first.datum()
-    with pytest.raises(ForgottenError, match=r"1 of the versions to keep under 'again' had left"):
-        cell.keep("again", [first])
+    with pytest.raises(
+        ForgottenError, match=r"1 of the versions to pin under 'again' had already left"
+    ):
+        cell.pin("again", [first])
 
 
 def test_labels_are_added_to_and_checked(cell, online):
     """A label collects; what is no label or no version is refused."""
     put(online, ARM, 1)
     put(online, LEG, 2)
-    cell.keep("both", online.history(ARM, COUNT))
+    cell.pin("both", online.history(ARM, COUNT))
 
-    cell.keep("both", online.history(LEG, COUNT))
+    cell.pin("both", online.history(LEG, COUNT))
 
-    assert [version.entity for version in cell.kept()["both"]] == [ARM, LEG]
+    assert [version.entity for version in cell.pinned()["both"]] == [ARM, LEG]
     for label, versions, told in (
         ("a b", online.history(ARM, COUNT), r"cannot name a label"),
-        ("empty", [], r"nothing to keep under 'empty'"),
+        ("empty", [], r"nothing to pin under 'empty'"),
         ("wrong", [1], r"1 is no version"),
     ):
         with pytest.raises(MisuseError, match=told):
-            cell.keep(label, versions)
-    cell.let_go("nobody-has-used-this")
+            cell.pin(label, versions)
+    cell.unpin("nobody-has-used-this")
+
+
+def test_old_names_of_pins_warn_and_work(cell, online):
+    """They go with the next release."""
+    online.init(ARM, COUNT, 1)
+    with pytest.warns(DeprecationWarning, match=r"Cell\.keep is now Cell\.pin"):
+        cell.keep("old", online.history(ARM, COUNT))
+    with pytest.warns(DeprecationWarning, match=r"Cell\.kept is now Cell\.pinned"):
+        assert list(cell.kept()) == ["old"]
+    with pytest.warns(DeprecationWarning, match=r"Cell\.let_go is now Cell\.unpin"):
+        cell.let_go("old")
+    assert cell.pinned() == {}
 
 
 def test_versions_of_several_shards_are_kept_under_one_label(two_stored):
@@ -175,15 +189,15 @@ def test_versions_of_several_shards_are_kept_under_one_label(two_stored):
     cell, online = two_stored.cell, two_stored.cell.world("online")
     put(online, LEFT, 1)
     put(online, RIGHT, 2)
-    cell.keep("both", [*online.history(LEFT, COUNT), *online.history(RIGHT, COUNT)])
+    cell.pin("both", [*online.history(LEFT, COUNT), *online.history(RIGHT, COUNT)])
 
     two_stored.stop("right")
     two_stored.start("right")
 
-    kept = cell.kept()["both"]
+    kept = cell.pinned()["both"]
     assert [(version.entity, version.datum()) for version in kept] == [(LEFT, 1), (RIGHT, 2)]
-    cell.let_go("both")
-    assert cell.kept() == {}
+    cell.unpin("both")
+    assert cell.pinned() == {}
 
 
 def test_history_beyond_one_answer_comes_in_several(cell, online, monkeypatch):
@@ -191,8 +205,8 @@ def test_history_beyond_one_answer_comes_in_several(cell, online, monkeypatch):
     for number in range(12):
         put(online, ARM, number)
         put(online, LEG, number)
-    cell.keep("label", online.history(ARM, COUNT)[:7])
-    cell.keep("label", online.history(LEG, COUNT)[2:8])
+    cell.pin("label", online.history(ARM, COUNT)[:7])
+    cell.pin("label", online.history(LEG, COUNT)[2:8])
     monkeypatch.setattr("enact_dist.core.protocol.pages.PAGE_BYTES_MAX", 2_000)
 
     versions = online.history(ARM, COUNT)
@@ -202,7 +216,7 @@ def test_history_beyond_one_answer_comes_in_several(cell, online, monkeypatch):
     assert [v.version for v in online.history(ARM, COUNT, count=10)] == list(range(3, 13))
     since = versions[5].position
     assert [v.version for v in online.history(ARM, COUNT, since=since)] == list(range(6, 13))
-    kept = cell.kept()["label"]
+    kept = cell.pinned()["label"]
     assert [(v.entity, v.version) for v in kept] == [
         *((ARM, version) for version in range(1, 8)),
         *((LEG, version) for version in range(3, 9)),

@@ -273,19 +273,19 @@ def test_forgotten_version_cannot_be_explained_itself():
 
 
 def test_kept_tree_outlives_the_retention():
-    """What `cell.keep` takes of a tree is explained later, too, with what went into it."""
+    """What `cell.pin` takes of a tree is explained later, too, with what went into it."""
     clock = ManualClock()
     with worlds("online", clock=clock) as cell:
         online = cell.world("online")
         replaced(online, clock, times=1)
         added(online, Read(online, here, FEW))
-        cell.keep("incident", cell.why("online", total, SUM).walk())
+        cell.pin("incident", cell.why("online", total, SUM).walk())
         replaced(online, clock, times=3)
 
         tree = cell.why("online", total, SUM)
 
         assert [one.kind for one in tree.walk()] == ["commit", "commit"]
-        assert [version.version for version in cell.kept()["incident"]] == [1, 1]
+        assert [version.version for version in cell.pinned()["incident"]] == [1, 1]
 
 
 def test_deletion_is_a_version_with_a_cause(cell, online):

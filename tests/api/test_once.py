@@ -279,7 +279,7 @@ def test_update_sees_what_it_declared_and_writes_at_the_end(cell, online):
 
 def taken_by(online, session, version=1):
     """Leave a version as taken, as an actor does that is killed before its outcome."""
-    (found,) = (slot for slot in online.survey(ROBOT.name) if slot.aspect == "plan")
+    (found,) = (slot for slot in online.list_slots(ROBOT.name) if slot.aspect == "plan")
     left = Outcome("taken", version, found.position.stamp_ns, actor="Robot, process 7 on cell-1",
                    session=session, run="before")  # fmt: skip
     write(online, OUTCOME, left)

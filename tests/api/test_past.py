@@ -96,7 +96,7 @@ def test_pattern_of_the_past_has_what_was_deleted_since_and_not_what_came(online
 
     assert each_of(past) == {ARM: 1, LEG: 2}
     assert past.entities() == (ARM, LEG)
-    assert [(info.entity, info.version) for info in past.survey("a*")] == [(ARM, 1)]
+    assert [(info.entity, info.version) for info in past.list_slots("a*")] == [(ARM, 1)]
     assert each_of(online) == {LEG: 2, Entity("head"): 3}
 
 
@@ -153,7 +153,7 @@ def test_raw_datum_of_the_past_needs_no_type(online):
     then = put(online, ARM, 1)
     put(online, ARM, 2)
 
-    assert online.at(then).raw(ARM, "count") == 1
+    assert online.at(then).get_untyped(ARM, "count") == 1
 
 
 # ---------------------------------------------------------------- what it refuses
@@ -260,7 +260,7 @@ def test_past_of_a_dropped_context_is_gone(cell, online):
 
     cell.drop_world("what_if")
 
-    for use in (lambda: value_of(past, ARM), past.survey):
+    for use in (lambda: value_of(past, ARM), past.list_slots):
         with pytest.raises(UnknownWorldError, match=r"what_if"):
             use()
 
@@ -282,7 +282,7 @@ def test_data_are_shown_by_when_they_were_captured(online):
     assert each_of(nearest) == {ARM: 20, LEG: 7}
     assert value_of(middle, ARM) == 30
     assert each_of(exact) == {ARM: 20}
-    assert [(info.entity, info.version) for info in exact.survey()] == [(ARM, 2)]
+    assert [(info.entity, info.version) for info in exact.list_slots()] == [(ARM, 2)]
     with pytest.raises(NullDatumError, match=r"outside retention"):
         value_of(online.at(stamp_ns=11), ARM)
     assert (exact.at_ns, exact.stamp_ns) == (0, 20 * 10**9)

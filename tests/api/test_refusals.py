@@ -108,7 +108,7 @@ def test_fork_that_would_miss_a_kept_version_is_told_a_moment_that_has_all(cell,
     """What a label keeps is known as of then, and may be unknown just after."""
     a, b = Entity("a"), Entity("b")
     write_times(online, a, 1)
-    cell.keep("first", online.history(a, COUNT))
+    cell.pin("first", online.history(a, COUNT))
     then = write_times(online, b, 1)
     write_times(online, a, 1)
     write_times(online, b, 2)

@@ -154,10 +154,10 @@ def test_observer_registers_nothing(two_shards):
         seen = looking.world("online")
         for asked in (View(seen, right, PLAN), View(seen, left, MISSPELT)):
             assert seen.view(asked).get(asked) is None
-        assert seen.raw(left, "plan") == [1.0]
+        assert seen.get_untyped(left, "plan") == [1.0]
         with pytest.raises(NullDatumError):
-            seen.raw(right, "plan")
-        assert len(seen.at(online.history(left, PLAN)[0].position).survey()) == 1
+            seen.get_untyped(right, "plan")
+        assert len(seen.at(online.history(left, PLAN)[0].position).list_slots()) == 1
         assert seen.diff(seen, aspects=[PLAN]).rows == ()
         with seen.watch("**", PLAN, MISSPELT) as watch:
             assert watch.next(60.0) is not None

@@ -62,7 +62,7 @@ def test_init_refuses_a_datum_of_another_type_and_sets_nothing(online):
     """A refused init leaves the slot as it was."""
     with pytest.raises(DatumTypeError):
         online.init(bench, COUNT, 1.5)
-    assert online.survey() == ()
+    assert online.list_slots() == ()
 
 
 @pytest.mark.parametrize(
@@ -210,13 +210,13 @@ def test_survey_lists_slots_with_versions_sizes_and_nulls(online):
     online.init(piece, CLOUD, np.zeros(1000))
     online.init(bench, COUNT, 1)
     delete(Write(online, bench, COUNT))
-    first, second = online.survey()
+    first, second = online.list_slots()
     assert (first.entity, first.aspect, first.version) == (bench, "count", 2)
     assert first.null_reason == "deleted"
     assert (second.entity, second.version, second.null_reason) == (piece, 1, "")
     assert second.size_bytes >= 8000
-    assert online.survey("work_p*", ("cloud",)) == (second,)
-    assert online.survey("other/**") == ()
+    assert online.list_slots("work_p*", ("cloud",)) == (second,)
+    assert online.list_slots("other/**") == ()
 
 
 def test_entities_are_those_with_some_datum(online):
@@ -233,14 +233,14 @@ def test_raw_shows_a_datum_without_its_type(online):
     """A dataclass comes as a dict that names its type; numbers come as they are."""
     online.init(piece, Aspect("pose", Pose), Pose(np.zeros(3), "base"))
     online.init(bench, COUNT, 4)
-    raw = online.raw(piece, "pose")
+    raw = online.get_untyped(piece, "pose")
     assert raw["__type__"] == "Pose"
     assert raw["frame"] == "base"
-    assert online.raw(bench, "count") == 4
+    assert online.get_untyped(bench, "count") == 4
     with pytest.raises(NullDatumError):
-        online.raw(piece, "count")
+        online.get_untyped(piece, "count")
     with pytest.raises(MisuseError, match=r"no aspect 'colour'.*count, pose"):
-        online.raw(bench, "colour")
+        online.get_untyped(bench, "colour")
 
 
 def test_ten_thousand_entities_are_viewed_and_surveyed_whole(online):
@@ -253,4 +253,4 @@ def test_ten_thousand_entities_are_viewed_and_surveyed_whole(online):
             lock[each].update({Entity(f"part/{n}"): n for n in range(start, start + 2_500)})
     view = ViewEach(online, Entities("part/*"), COUNT)
     assert sum(online.view(view)[view].values()) == sum(range(10_000))
-    assert len(online.survey("part/*")) == 10_000
+    assert len(online.list_slots("part/*")) == 10_000

@@ -92,8 +92,8 @@ def test_kept_tree_is_listed_under_its_label(ask, cell):
     """`--keep` takes every version of the tree; `enact world kept` shows them."""
     assert ask("why", "online", "system/sum@1", "--keep", "incident").status == 0
 
-    kept = cell.kept()["incident"]
-    cell.let_go("incident")
+    kept = cell.pinned()["incident"]
+    cell.unpin("incident")
 
     assert {str(version.slot) for version in kept} == {
         "online:system/sum",

@@ -28,7 +28,7 @@ def stopped(write_cell):
             for value in (1, 2):
                 with Lock(number, cloud) as lock:
                     lock[number], lock[cloud] = value, np.zeros(10_000)
-            cell.keep("best", online.history(number.entity, NUMBER)[:1])
+            cell.pin("best", online.history(number.entity, NUMBER)[:1])
     return file
 
 
@@ -58,7 +58,7 @@ def test_it_goes_and_another_type_comes(enact, stopped):
         write = Write(cell.world("online"), Entity("part/left"), Aspect("number", str))
         with Lock(write) as lock:
             lock[write] = "three"
-        assert cell.kept() == {}
+        assert cell.pinned() == {}
 
 
 def test_json_says_all_of_it(enact, stopped):
@@ -146,7 +146,7 @@ def test_what_has_no_data_goes_at_once(enact, stopped):
     with local(stopped.parent / "data" / "left") as cell:
         assert "catalogue_left_out" not in cell.shards()[0].counters
         cell.create_world("lab")
-        assert [info.version for info in cell.world("online").survey("**")] == [2, 2]
+        assert [info.version for info in cell.world("online").list_slots("**")] == [2, 2]
         assert sorted(cell.aspects()) == ["cloud", "number"]
 
 

@@ -41,7 +41,7 @@ def test_each_aspect_is_listed_with_what_there_is_of_it(enact, cell, cell_file):
         "size_bytes": 5 * 800 + 80,
         "older_types": [],
     }
-    assert rows["plan"]["shards"] == [cell.world("training").survey(aspects=("plan",))[0].shard]
+    assert rows["plan"]["shards"] == [cell.world("training").list_slots(aspects=("plan",))[0].shard]
     words = ("world", "aspects", "training", "--cell", cell_file)
     rows = {row["aspect"]: row for row in enact(*words, "--json").json}
     assert (rows["cloud"]["slots"], rows["plan"]["data"]) == (1, 1)

@@ -242,7 +242,7 @@ def test_the_future_is_refused_however_far(at, made, time):
     done = at("at", made.name, time)
 
     assert done.status == 1
-    assert "in the future, of which nothing is known" in done.err
+    assert "in the future, which is unknown" in done.err
     assert "datetime.datetime" not in done.err
 
 

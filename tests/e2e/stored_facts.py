@@ -61,7 +61,7 @@ def fill(cell):
                 lock.put(pose, Pose(np.arange(3.0) + number, "table"), stamp_ns=stamp_ns)
                 lock.put(picture, image(10 * part + number), stamp_ns=stamp_ns)
                 lock[guess] = 0.5
-    cell.keep("first", online.history(PARTS[0], IMAGE)[:1])
+    cell.pin("first", online.history(PARTS[0], IMAGE)[:1])
     fork = online.fork("trial")
     with Lock(Write(fork, PARTS[1], COUNT)) as lock:
         lock[Write(fork, PARTS[1], COUNT)] = -1
@@ -83,7 +83,7 @@ def data_of(world, *, volatile=True):
     """Return the newest data of a context."""
     found = {}
     for entity in world.entities():
-        for info in world.survey(entity):
+        for info in world.list_slots(entity):
             aspect = ASPECTS[info.aspect]
             if info.null_reason or (aspect is GUESS and not volatile):
                 continue
@@ -106,7 +106,7 @@ def facts_of(cell):
                 one.stamp_ns,
                 one.size_bytes,
                 one.null_reason,
-                list(one.kept),
+                list(one.pinned),
                 None if one.null_reason else shown(one.datum()),
             ]
             for one in world.history(entity, aspect)
@@ -118,7 +118,7 @@ def facts_of(cell):
     }
     found["kept"] = {
         label: [f"{one.slot} v{one.version}" for one in versions]
-        for label, versions in cell.kept().items()
+        for label, versions in cell.pinned().items()
     }
     diff = worlds["online"].diff(worlds["trial"])
     found["diff"] = sorted(f"{row.entity.name} {row.aspect} {row.kind}" for row in diff.rows)

@@ -34,7 +34,7 @@ def shown(cell):
                     why = cell.why(world, entity, aspect, version=one.version)
                     made_of = sorted((*cause.slot, cause.version) for cause in why.walk())
                     datum = np.asarray(one.datum()).tobytes()
-                    row = (datum, one.position.stamp_ns, one.until_ns, one.kept, made_of)
+                    row = (datum, one.position.stamp_ns, one.until_ns, one.pinned, made_of)
                     found[name, entity.name, aspect.name, one.version] = row
     return found
 
@@ -60,7 +60,7 @@ def test_a_third_shard_gets_its_entities_and_a_backup_comes_back(make_cell, port
                 lock.get(read, None)
                 lock[write] = np.full(20_000, number)
             put(online, entity, POSE, [number, number])
-        joined.keep("best", online.history(PARTS[3], POSE)[:1])
+        joined.pin("best", online.history(PARTS[3], POSE)[:1])
         online.fork("what_if")
         before = shown(joined)
 

@@ -106,7 +106,7 @@ def test_missing_shard_is_an_error_that_names_shard_and_endpoint(make_cell):
         online = joined.world("online")
         cell.kill("s1")
         with pytest.raises(ShardUnreachableError, match=rf"s1 at tcp/127.0.0.1:{cell.ports['s1']}"):
-            online.survey()
+            online.list_slots()
         joined._client.patience_s = 10.0
         states = {shard.name: shard.reachable for shard in joined.shards()}
         assert states == {"s0": True, "s1": False}

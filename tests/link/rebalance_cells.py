@@ -135,7 +135,7 @@ class StoppedCell:
             for cell in cells.values():
                 found = [v for slot in _slots(cell) for v in _history(cell, slot)]
                 found = [v for v in found if v.position.stamp_ns and v.version]
-                cell.keep(label, rng.sample(found, min(3, len(found))))
+                cell.pin(label, rng.sample(found, min(3, len(found))))
 
     # ---------------------------------------------------------------- what there is
 
@@ -151,7 +151,7 @@ class StoppedCell:
                 (n, cell.world(n).forked_from) for cell in cells.values() for n in cell.worlds()
             }
             for shard, cell in cells.items():
-                for label, versions in cell.kept().items():
+                for label, versions in cell.pinned().items():
                     named = {(*v.slot, v.version, v.position.stamp_ns) for v in versions}
                     labels[label] = labels.get(label, set()) | named
                 for slot in _slots(cell):
@@ -193,7 +193,7 @@ def _shown_of(cell, slot, probes_ns):
             read = sorted((*c.slot, c.version) for c in tree.children)
             why = (tree.kind, tree.actor, tree.pid, tree.held_s, tree.left_out, read)
         datum = None if v.null_reason else _plain(v.datum())
-        row = (v.version, v.position.stamp_ns, v.until_ns, v.stamp_ns, v.null_reason, v.kept)
+        row = (v.version, v.position.stamp_ns, v.until_ns, v.stamp_ns, v.null_reason, v.pinned)
         versions.append((row if v.version else row[:1], datum, why))
     past = [_at(cell.world(world).at(Position(ns, "local")), entity, aspect) for ns in probes_ns]
     return versions, past

@@ -60,7 +60,7 @@ def past_of(cell, entity, versions):
         past = online.at(Position(version.position.stamp_ns, "local"))
         found.append(past.view(view := View(past, entity, POSE))[view])
     known = [(one.version, one.datum()) for one in online.history(entity, POSE)]
-    return found, known, [(one.version, one.datum()) for one in cell.kept()["best"]]
+    return found, known, [(one.version, one.datum()) for one in cell.pinned()["best"]]
 
 
 @pytest.mark.parametrize("away", TWO_NAMES)
@@ -79,7 +79,7 @@ def test_what_another_shard_forgot_is_known_where_it_was_not(tmp_path, earlier, 
     with cell.opened() as cells:
         cell.put(cells, "online", mine, 3)
         versions = cells["left"].world("online").history(mine, POSE)[-3:]
-        cells["left"].keep("best", versions[:1])
+        cells["left"].pin("best", versions[:1])
         before = past_of(cells["left"], mine, versions)
     forget({"right": cell.folders["right"]}, ["pose"], now_ns=time.time_ns())
 

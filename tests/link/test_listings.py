@@ -138,7 +138,7 @@ def test_label_that_keeps_more_than_a_page_is_told_whole(daemon, endpoint, monke
         for number in range(8):
             online.init(Entity(f"tray/{number}"), count, number)
         versions = [one for n in range(8) for one in online.history(Entity(f"tray/{n}"), count)]
-        cell.keep("all", versions)
+        cell.pin("all", versions)
         asked = [SlotVersion(one.slot, one.version) for one in versions]
         client = cell._client
         take = client.carrier.request

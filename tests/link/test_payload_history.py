@@ -85,7 +85,7 @@ def test_room_is_made_of_the_oldest_history_and_never_of_what_is_kept(cell):
     """At the cap a write goes on as long as history is left; a label's version stays readable."""
     online = cell.world("online")
     publish(online, 1)
-    cell.keep("evening", online.history(TRAY, CLOUD))
+    cell.pin("evening", online.history(TRAY, CLOUD))
     for number in range(2, 9):
         publish(online, number)
         assert cell.files() <= FILES_MAX
@@ -95,7 +95,7 @@ def test_room_is_made_of_the_oldest_history_and_never_of_what_is_kept(cell):
     assert [version.version for version in found] == [1, 6, 7, 8]
     assert [int(version.datum()[0]) for version in found] == [1, 6, 7, 8]
 
-    cell.let_go("evening")
+    cell.unpin("evening")
     assert cell.files() == 3
     with pytest.raises(ForgottenError):
         found[0].datum()

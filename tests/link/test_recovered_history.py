@@ -26,7 +26,7 @@ def restarted(daemon, endpoint, tmp_path):
     with connect(endpoint) as cell:
         online = cell.world("online")
         positions = [publish(online, 1)]
-        cell.keep("first", online.history(TRAY, CLOUD))
+        cell.pin("first", online.history(TRAY, CLOUD))
         positions += [publish(online, number) for number in range(2, 7)]
         online.fork("fork", at=positions[2])
     shard.stop()
@@ -46,7 +46,7 @@ def test_history_forks_and_labels_are_there_after_a_restart(restarted):
         found = online.history(TRAY, CLOUD)
         assert [version.version for version in found] == [1, 3, 4, 5, 6]
         assert [int(version.datum()[0]) for version in found] == [1, 3, 4, 5, 6]
-        assert cell.kept()["first"][0].version == 1
+        assert cell.pinned()["first"][0].version == 1
         for world in (fork, online.at(restarted.positions[2])):
             request = View(world, TRAY, CLOUD)
             assert int(world.view(request)[request][0]) == 3

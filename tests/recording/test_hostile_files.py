@@ -154,7 +154,7 @@ def test_name_that_is_none_is_refused_without_being_written_anywhere(cell, tmp_p
         Replay(cell, path, speed=0.0).run()
 
     assert str(refused.value).isprintable()
-    assert not any(world.survey() for world in map(cell.world, cell.worlds()))
+    assert not any(world.list_slots() for world in map(cell.world, cell.worlds()))
 
 
 @pytest.mark.parametrize(

@@ -239,7 +239,7 @@ def test_record_and_replay_give_the_same_context(cell, online, tmp_path):
         put((count, None))
     Replay(cell, path, worlds={"online": "copy"}, speed=0.0).run()
     assert same_data(online, cell.world("copy"))
-    assert len(cell.world("copy").survey()) == 3
+    assert len(cell.world("copy").list_slots()) == 3
 
 
 def test_recording_of_a_replay_is_the_recording(cell, online, tmp_path):

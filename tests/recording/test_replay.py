@@ -80,7 +80,7 @@ def test_worlds_and_aspects_are_made(cell, run):
     replayed(cell, run, worlds={"online": "copy"})
     copy = cell.world("copy")
     assert copy.view(View(copy, piece, VALUE))[View(copy, piece, VALUE)] == 10
-    assert not cell.world("online").survey()
+    assert not cell.world("online").list_slots()
     assert cell.aspects()["value"][0] == "int"
 
 
@@ -95,7 +95,7 @@ def test_world_with_other_data_is_left_alone(cell, online, run):
     online.init(piece, Aspect("name", str), "mine")
     with pytest.raises(MisuseError, match=r"piece/name.*--overwrite"):
         replayed(cell, run)
-    assert len(online.survey()) == 1
+    assert len(online.list_slots()) == 1
     assert replayed(cell, run, overwrite=True).commits == 10
 
 
@@ -246,7 +246,7 @@ def test_more_than_one_lock_may_write_comes_in_several(cell, online, tmp_path, m
     recording.close({})
     summary = replayed(cell, path)
     assert (summary.versions, summary.commits) == (7, 0)
-    assert len(online.survey()) == 7
+    assert len(online.list_slots()) == 7
 
 
 def test_speed_that_makes_no_sense_is_refused(cell, run):
@@ -263,7 +263,7 @@ def test_several_worlds_of_one_commit_stay_one_commit(cell, tmp_path):
     recording.add_commit(pair, BEGIN_NS)
     recording.close({})
     assert replayed(cell, path).commits == 1
-    stamps = {cell.world(name).survey()[0].position for name in ("online", "training")}
+    stamps = {cell.world(name).list_slots()[0].position for name in ("online", "training")}
     assert len(stamps) == 1
 
 

@@ -45,7 +45,7 @@ def replayed_slots(cell, run, **options):
     found = [
         f"{world}:{info.entity}/{info.aspect}"
         for world in cell.worlds()
-        for info in cell.world(world).survey()
+        for info in cell.world(world).list_slots()
     ]
     assert summary.versions == len(found)
     return found

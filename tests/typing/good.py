@@ -90,7 +90,7 @@ def travel(when: datetime) -> None:
         assert_type(online.at(1763719200.5), PastContext)
         assert_type(online.at(stamp_ns=17, nearest=True), PastContext)
         assert_type(online.fork("what_if", at=when).forked_from, tuple[str, int] | None)
-        cell.keep("label", [*versions, *online.history(piece, MESH)])
+        cell.pin("label", [*versions, *online.history(piece, MESH)])
         assert_type(cell.drop_world("what_if"), int)
 
 

@@ -56,7 +56,7 @@ def missing(
 def _likely(world: WorldContext | PastContext, entity: str, aspect: str) -> list[str]:
     """Return the names of data of the same entity, or of the same aspect."""
     try:
-        infos = world.survey()
+        infos = world.list_slots()
     except EnactError:
         return []  # the error itself is reported anyway
     names = (

@@ -11,7 +11,7 @@ from enact_dist.cli.text.output import print_json, print_tree, shown_bytes, show
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from enact_dist.world.listings import SlotInfo
+    from enact_dist.access.snapshot import SlotInfo
 
 
 @dataclass(slots=True)

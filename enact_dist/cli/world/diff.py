@@ -33,13 +33,13 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from enact_dist.access.arguments import When
+    from enact_dist.access.snapshot import SlotInfo
     from enact_dist.cli.verbs import Verb
     from enact_dist.compare.diff import Comparison, Diff
     from enact_dist.comparing import Tolerance
     from enact_dist.config.types import CellConfig
     from enact_dist.world.cell import Cell
     from enact_dist.world.context import WorldContext
-    from enact_dist.world.listings import SlotInfo
     from enact_dist.world.past import PastContext
 
 ROWS_SHOWN_MAX: Final = 12

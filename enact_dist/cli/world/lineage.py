@@ -81,7 +81,7 @@ def show_causes(arguments: argparse.Namespace) -> int:
     with open_cell(arguments, observer=not arguments.keep) as cell:
         tree = cell.why(arguments.world, entity, aspect, version, depth=arguments.depth)
         if arguments.keep:
-            cell.keep(arguments.keep, (one for one in tree.walk() if one.known))
+            cell.pin(arguments.keep, (one for one in tree.walk() if one.known))
         _print(tree, arguments)
     return DONE
 

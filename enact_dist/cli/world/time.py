@@ -28,8 +28,7 @@ from enact_dist.terms import Aspect, Entity
 
 if TYPE_CHECKING:
     from enact_dist.cli.verbs import Verb
-    from enact_dist.world.context import WorldContext
-    from enact_dist.world.history import Version
+    from enact_dist.world.context import Version, WorldContext
 
 
 def add_verbs(verbs: argparse._SubParsersAction[Verb]) -> None:
@@ -157,7 +156,7 @@ def _row(version: Version[Any]) -> tuple[str, ...]:
     stamp_ns = version.position.stamp_ns
     size = shown_bytes(version.size_bytes) if version.size_bytes else ""
     notes = [f"null: {version.null_reason}"] if version.null_reason else []
-    notes += [f"kept as {', '.join(version.kept)}"] if version.kept else []
+    notes += [f"kept as {', '.join(version.pinned)}"] if version.pinned else []
     return (
         f"v{version.version}",
         moment_name(stamp_ns),
@@ -189,7 +188,7 @@ def _facts(version: Version[Any]) -> dict[str, object]:
         "captured_ns": version.stamp_ns,
         "size_bytes": version.size_bytes,
         "null_reason": version.null_reason,
-        "kept": list(version.kept),
+        "kept": list(version.pinned),
         "cause": None
         if cause is None
         else {"kind": cause.kind, "actor": cause.actor, "host": cause.host, "pid": cause.pid},
@@ -222,10 +221,10 @@ def show_past(arguments: argparse.Namespace) -> int:
         past = cell.world(arguments.world).at(arguments.moment)
         if gets:
             with named_if_missing(past, slot):
-                datum = past.raw(Entity(slot[0]), slot[1])
+                datum = past.get_untyped(Entity(slot[0]), slot[1])
             print_datum(datum, out=arguments.out, as_json=arguments.json)
             return DONE
-        infos = past.survey(pattern)
+        infos = past.list_slots(pattern)
     title = f"{past.name} at {moment_name(past.at_ns)}"
     print_slots(title, infos, as_json=arguments.json, at_ns=past.at_ns)
     return DONE
@@ -280,7 +279,7 @@ def keep_versions(arguments: argparse.Namespace) -> int:
     with open_cell(arguments, observer=False) as cell:
         world = cell.world(arguments.world)
         versions = [_version(world, *named) for named in arguments.slots]
-        cell.keep(arguments.label, versions)
+        cell.pin(arguments.label, versions)
     if arguments.json:
         print_json([_facts(version) for version in versions])
     else:
@@ -305,7 +304,7 @@ def _version(world: WorldContext, entity: str, aspect: str, number: int) -> Vers
 def list_kept(arguments: argparse.Namespace) -> int:
     """Print what labels keep."""
     with open_cell(arguments) as cell:
-        kept = cell.kept()
+        kept = cell.pinned()
     if arguments.json:
         print_json({label: [_facts(each) for each in versions] for label, versions in kept.items()})
         return DONE
@@ -324,9 +323,9 @@ def list_kept(arguments: argparse.Namespace) -> int:
 def let_go_of(arguments: argparse.Namespace) -> int:
     """Release the versions of a label; status 1 if it keeps none."""
     with open_cell(arguments, observer=False) as cell:
-        kept = cell.kept()
+        kept = cell.pinned()
         versions = kept.get(arguments.label, ())
-        cell.let_go(arguments.label)
+        cell.unpin(arguments.label)
     if arguments.json:
         print_json({"label": arguments.label, "versions": len(versions)})
     elif versions:

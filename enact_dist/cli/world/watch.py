@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from enact_dist.cli.verbs import Verb
     from enact_dist.world.cell import Cell
     from enact_dist.world.context import WorldContext
-    from enact_dist.world.version_data import Found
+    from enact_dist.world.version_data import Retained
 
 WATCH_SLICE_S: Final = 0.2
 """How soon a watch notices a signal."""
@@ -276,7 +276,7 @@ def _found(session: Session, changes: Iterable[Change]) -> dict[Wanted, object]:
     return {each: _datum(found.get(each)) for each in wanted}
 
 
-def _datum(found: Found | None) -> object:
+def _datum(found: Retained | None) -> object:
     if found is None or found.datum is None:
         return _Absent("replaced and no longer retained before it could be fetched")
     try:

@@ -128,7 +128,7 @@ def list_worlds(arguments: argparse.Namespace) -> int:
         rows: list[dict[str, Any]] = []
         for name in cell.worlds():
             world = cell.world(name)
-            known = [info for info in world.survey() if not info.null_reason]
+            known = [info for info in world.list_slots() if not info.null_reason]
             rows.append(
                 {
                     "world": name,
@@ -168,7 +168,7 @@ def show_tree(arguments: argparse.Namespace) -> int:
     with open_cell(arguments) as cell:
         infos = [
             info
-            for info in cell.world(arguments.world).survey(Entities(arguments.pattern))
+            for info in cell.world(arguments.world).list_slots(Entities(arguments.pattern))
             if arguments.null or not info.null_reason
         ]
     print_slots(arguments.world, infos, as_json=arguments.json)
@@ -184,7 +184,7 @@ def get_datum(arguments: argparse.Namespace) -> int:
     with open_cell(arguments) as cell:
         world = cell.world(arguments.world)
         with named_if_missing(world, arguments.slot):
-            datum = world.raw(Entity(entity), aspect)
+            datum = world.get_untyped(Entity(entity), aspect)
     print_datum(datum, out=arguments.out, as_json=arguments.json)
     return DONE
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from enact_dist.core.protocol.datum import Datum, LockId, Position, Slot, Token
-from enact_dist.core.protocol.message import message
+from typing import NamedTuple
+
+from enact_dist.core.protocol.datum import Datum, LockId, Position, Slot, Token, message
 from enact_dist.core.protocol.parts import (
     START,
     AspectEntry,
@@ -397,3 +398,64 @@ class Kept:
     versions: tuple[SlotVersion, ...]
     forgotten: tuple[SlotVersion, ...]
     more: Cursor = START
+
+
+Answer = (
+    Welcome
+    | Registered
+    | Granted
+    | Waiting
+    | Stale
+    | Viewed
+    | Slice
+    | Gone
+    | Alive
+    | Committed
+    | Fenced
+    | Changed
+    | Prepared
+    | Finished
+    | Resolved
+    | OutcomeIs
+    | Valid
+    | Released
+    | Reached
+    | Pong
+    | Places
+    | Surveyed
+    | Locks
+    | Sessions
+    | Broken
+    | Audited
+    | Staged
+    | Versions
+    | Forgotten
+    | Forked
+    | Dropped
+    | Kept
+    | EpochChanged
+    | WrongShard
+    | Refused
+)
+
+# ---------------------------------------------------------------- notices (published, best effort)
+
+
+class SlotChange(NamedTuple):
+    """One committed write, without its data; `captured_ns` is the datum's own stamp (0: none)."""
+
+    slot: Slot
+    version: int
+    stamp_ns: int
+    null: bool
+    captured_ns: int = 0
+
+
+@message
+class Notice:
+    """What one commit changed; `number` counts notices of a shard's epoch without a gap."""
+
+    shard: str
+    epoch: int
+    number: int
+    changes: tuple[SlotChange, ...]

@@ -5,13 +5,23 @@ The core never looks into a datum: `encoding` and `body` are made and read by `e
 
 from __future__ import annotations
 
-from dataclasses import field
-from typing import TYPE_CHECKING, NamedTuple
-
-from enact_dist.core.protocol.message import message
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NamedTuple, TypeVar, dataclass_transform
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+T = TypeVar("T")
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(field,))
+def message(cls: type[T]) -> type[T]:
+    """Make a dataclass of a message, record or datum: with slots, and never changed once made.
+
+    The type checker enforces that it never changes.  A dataclass that is also frozen at run time
+    takes five times as long to create, and one update creates thirty.
+    """
+    return dataclass(slots=True, unsafe_hash=True)(cls)
 
 
 class Slot(NamedTuple):

@@ -1,29 +1,27 @@
-"""What client and shard say to each other.  Requests and answers, frozen, validated by `wire`.
+"""What clients and shards say to each other: the one place to import a message or its parts from.
 
 Each request is answered by exactly one of the answers named in its docstring, by `EpochChanged`
 (the shard does not know this session in this epoch) or by `Refused` (the request itself is wrong).
 No answer at all means *unknown*, never *not executed*.
 
 Field types are limited to those that `wire.frames` can carry: int, str, bytes, bool, None, tuples
-of these, NamedTuples and dataclasses of the protocol's four files and of `core.protocol.datum`.
+of these, NamedTuples and the dataclasses of this package.
 
 ::
 
-    message_parts      the parts of several messages
-    requests           the requests, each with the name of its answer
-    answers            the answers of a shard
-    messages           notices, and all names of the protocol
+    datum       addresses, identities, the datum, and the decorator of all messages
+    parts       the parts of several messages
+    requests    the requests, each with the name of its answer, and those with pages
+    answers     the answers of a shard, and its notices
 
-Durations travel, points in time do not (except wall-clock stamps): clocks are never compared.
+Durations are sent, points in time are not (except wall-clock stamps): clocks are never compared.
 
-Listings come in pages (see `core.protocol.pages`): an answer with a cursor in `more` is asked on
-with that cursor in `after`.  A cursor of an earlier epoch is answered `EpochChanged`: list from the
-begin.
+Listings come in pages (see `core.protocol.pages`): if an answer has a cursor in `more`, repeat the
+request with that cursor in `after`.  A cursor of an earlier epoch is answered `EpochChanged`: list
+again from the start.
 """
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 from enact_dist.core.protocol.answers import (
     OUTCOME_COMMITTED,
@@ -34,6 +32,7 @@ from enact_dist.core.protocol.answers import (
     RESOLVED_COMMITTED,
     RESOLVED_OPEN,
     Alive,
+    Answer,
     Audited,
     Broken,
     Changed,
@@ -48,6 +47,7 @@ from enact_dist.core.protocol.answers import (
     Granted,
     Kept,
     Locks,
+    Notice,
     OutcomeIs,
     Places,
     Pong,
@@ -59,6 +59,7 @@ from enact_dist.core.protocol.answers import (
     Resolved,
     Sessions,
     Slice,
+    SlotChange,
     Staged,
     Stale,
     Surveyed,
@@ -69,9 +70,11 @@ from enact_dist.core.protocol.answers import (
     Welcome,
     WrongShard,
 )
-from enact_dist.core.protocol.datum import Slot
-from enact_dist.core.protocol.message import message
 from enact_dist.core.protocol.parts import (
+    CAUSE_COMMIT,
+    CAUSE_FORK,
+    NO_LIMIT,
+    READS_MAX,
     START,
     AspectEntry,
     AuditEntry,
@@ -94,6 +97,7 @@ from enact_dist.core.protocol.parts import (
     WriteItem,
 )
 from enact_dist.core.protocol.requests import (
+    PAGED,
     Acquire,
     AwaitStamp,
     Break,
@@ -119,6 +123,7 @@ from enact_dist.core.protocol.requests import (
     Prepare,
     Register,
     Release,
+    Request,
     Resolve,
     Stage,
     Survey,
@@ -126,202 +131,4 @@ from enact_dist.core.protocol.requests import (
     Validate,
 )
 
-# ---------------------------------------------------------------- notices (published, best effort)
-
-
-class Change(NamedTuple):
-    """One committed write, without its data; `captured_ns` is the datum's own stamp (0: none)."""
-
-    slot: Slot
-    version: int
-    stamp_ns: int
-    null: bool
-    captured_ns: int = 0
-
-
-@message
-class Notice:
-    """What one commit changed; `number` counts notices of a shard's epoch without a gap."""
-
-    shard: str
-    epoch: int
-    number: int
-    changes: tuple[Change, ...]
-
-
-Request = (
-    Hello
-    | Register
-    | Acquire
-    | TakeView
-    | Fetch
-    | KeepAlive
-    | Commit
-    | Outcome
-    | Validate
-    | Prepare
-    | Finish
-    | Resolve
-    | Release
-    | Goodbye
-    | AwaitStamp
-    | Ping
-    | ListPlaces
-    | Survey
-    | ListLocks
-    | ListSessions
-    | Break
-    | ForceAbort
-    | ListAudit
-    | Stage
-    | ListHistory
-    | Explain
-    | FindEffects
-    | Fork
-    | DropWorld
-    | KeepVersions
-)
-Answer = (
-    Welcome
-    | Registered
-    | Granted
-    | Waiting
-    | Stale
-    | Viewed
-    | Slice
-    | Gone
-    | Alive
-    | Committed
-    | Fenced
-    | Changed
-    | Prepared
-    | Finished
-    | Resolved
-    | OutcomeIs
-    | Valid
-    | Released
-    | Reached
-    | Pong
-    | Places
-    | Surveyed
-    | Locks
-    | Sessions
-    | Broken
-    | Audited
-    | Staged
-    | Versions
-    | Forgotten
-    | Forked
-    | Dropped
-    | Kept
-    | EpochChanged
-    | WrongShard
-    | Refused
-)
 Message = Request | Answer | Notice
-PAGED = (
-    *(Survey, ListLocks, ListSessions, ListAudit, ListHistory, Explain, FindEffects),
-    KeepVersions,
-)
-"""Requests with a cursor: their answers come in pages."""
-
-__all__ = [
-    "OUTCOME_COMMITTED",
-    "OUTCOME_EXPIRED",
-    "OUTCOME_PENDING",
-    "OUTCOME_UNSEEN",
-    "PAGED",
-    "RESOLVED_ABORTED",
-    "RESOLVED_COMMITTED",
-    "RESOLVED_OPEN",
-    "START",
-    "Acquire",
-    "Alive",
-    "Answer",
-    "AspectEntry",
-    "AuditEntry",
-    "Audited",
-    "AwaitStamp",
-    "Break",
-    "Broken",
-    "Cause",
-    "Change",
-    "Changed",
-    "Commit",
-    "Committed",
-    "Counter",
-    "Cursor",
-    "DatumRead",
-    "DropWorld",
-    "Dropped",
-    "EpochChanged",
-    "Explain",
-    "Fenced",
-    "Fetch",
-    "FindEffects",
-    "Finish",
-    "Finished",
-    "ForceAbort",
-    "Forgotten",
-    "Fork",
-    "Forked",
-    "Gone",
-    "Goodbye",
-    "GrantLeft",
-    "Granted",
-    "Hello",
-    "Holder",
-    "Item",
-    "KeepAlive",
-    "KeepVersions",
-    "Kept",
-    "LaneView",
-    "ListAudit",
-    "ListHistory",
-    "ListLocks",
-    "ListPlaces",
-    "ListSessions",
-    "Locks",
-    "Message",
-    "Notice",
-    "Outcome",
-    "OutcomeIs",
-    "Pin",
-    "Ping",
-    "PlacementMap",
-    "Places",
-    "Pong",
-    "Prepare",
-    "Prepared",
-    "Reached",
-    "Refused",
-    "Register",
-    "Registered",
-    "Release",
-    "Released",
-    "Request",
-    "Resolve",
-    "Resolved",
-    "SessionInfo",
-    "Sessions",
-    "ShardEntry",
-    "Slice",
-    "SlotState",
-    "SlotVersion",
-    "Stage",
-    "Staged",
-    "Stale",
-    "Survey",
-    "Surveyed",
-    "TakeView",
-    "Valid",
-    "Validate",
-    "VersionEntry",
-    "Versions",
-    "Viewed",
-    "Waiting",
-    "Welcome",
-    "WorldEntry",
-    "WriteItem",
-    "WrongShard",
-]

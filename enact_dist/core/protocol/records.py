@@ -9,8 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Final
 
-from enact_dist.core.protocol.datum import Datum, LockId, Position, Slot, Token
-from enact_dist.core.protocol.message import message
+from enact_dist.core.protocol.datum import Datum, LockId, Position, Slot, Token, message
 from enact_dist.core.protocol.messages import AspectEntry, Cause, Item, SlotVersion, WriteItem
 from enact_dist.terms import Durability, NullReason
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from enact_dist.core.protocol.datum import Datum, LockId, Position, Slot, Token
-from enact_dist.core.protocol.message import message
+from enact_dist.core.protocol.datum import Datum, LockId, Position, Slot, Token, message
 from enact_dist.core.protocol.parts import (
     START,
     AspectEntry,
@@ -419,3 +418,42 @@ class KeepVersions:
     epoch: int = 0
     count: int = 0
     after: Cursor = START
+
+
+Request = (
+    Hello
+    | Register
+    | Acquire
+    | TakeView
+    | Fetch
+    | KeepAlive
+    | Commit
+    | Outcome
+    | Validate
+    | Prepare
+    | Finish
+    | Resolve
+    | Release
+    | Goodbye
+    | AwaitStamp
+    | Ping
+    | ListPlaces
+    | Survey
+    | ListLocks
+    | ListSessions
+    | Break
+    | ForceAbort
+    | ListAudit
+    | Stage
+    | ListHistory
+    | Explain
+    | FindEffects
+    | Fork
+    | DropWorld
+    | KeepVersions
+)
+PAGED = (
+    *(Survey, ListLocks, ListSessions, ListAudit, ListHistory, Explain, FindEffects),
+    KeepVersions,
+)
+"""Requests with a cursor: their answers come in pages."""

@@ -28,7 +28,6 @@ from enact_dist.core.protocol.checks import unknown_world, wrong_name
 from enact_dist.core.protocol.datum import LockId, Slot
 from enact_dist.core.protocol.messages import (
     Cause,
-    Change,
     DatumRead,
     Dropped,
     DropWorld,
@@ -36,6 +35,7 @@ from enact_dist.core.protocol.messages import (
     Fork,
     Forked,
     Refused,
+    SlotChange,
     SlotVersion,
     WorldEntry,
 )
@@ -310,7 +310,7 @@ class WorldDesk:
             state.count("worlds_dropped")
             answer = Dropped(message.world, len(gone))
             changes = [
-                Change(slot, content.version + 1, stamp_ns, True)
+                SlotChange(slot, content.version + 1, stamp_ns, True)
                 for slot, content in gone
                 if content.datum is not None
             ]
@@ -391,7 +391,7 @@ def _told_of(world: WorldEntry) -> str:
     return "it is there and no fork"
 
 
-def _change(slot: Slot, content: Content) -> Change:
+def _change(slot: Slot, content: Content) -> SlotChange:
     datum = content.datum
     captured_ns = datum.stamp_ns if datum is not None else 0
-    return Change(slot, content.version, content.stamp_ns, datum is None, captured_ns)
+    return SlotChange(slot, content.version, content.stamp_ns, datum is None, captured_ns)

@@ -40,7 +40,6 @@ from enact_dist.core.protocol.messages import (
     OUTCOME_EXPIRED,
     OUTCOME_PENDING,
     OUTCOME_UNSEEN,
-    Change,
     Changed,
     Commit,
     Committed,
@@ -50,6 +49,7 @@ from enact_dist.core.protocol.messages import (
     Outcome,
     OutcomeIs,
     Refused,
+    SlotChange,
     SlotVersion,
     Valid,
     Validate,
@@ -329,7 +329,7 @@ class Commits:
         versions: tuple[SlotVersion, ...],
         stamp_ns: int,
         cause: Cause | None,
-    ) -> list[Change]:
+    ) -> list[SlotChange]:
         """Make writes visible; return what a notice tells of them."""
         changes, size = [], 0
         for (_, datum), (slot, version) in zip(writes, versions, strict=True):
@@ -338,11 +338,11 @@ class Commits:
             captured_ns = 0
             if datum is not None:
                 captured_ns, size = datum.stamp_ns, size + datum.size
-            changes.append(Change(slot, version, stamp_ns, datum is None, captured_ns))
+            changes.append(SlotChange(slot, version, stamp_ns, datum is None, captured_ns))
         self._count("bytes_written", size)
         return changes
 
-    def publish(self, changes: list[Change]) -> Iterable[Effect]:
+    def publish(self, changes: list[SlotChange]) -> Iterable[Effect]:
         """Tell everybody who watches."""
         if not changes:
             return ()

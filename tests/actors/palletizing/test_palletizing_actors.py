@@ -151,7 +151,8 @@ def test_training_goes_on_after_a_crash():
             testing.run_once(second, cell)
 
         after = {
-            info.entity: info.version for info in cell.world("training").survey(VIEWS, ("cloud",))
+            info.entity: info.version
+            for info in cell.world("training").list_slots(VIEWS, ("cloud",))
         }
         assert len(before) == 2
         assert after == {view_entity("yoghurt_cup", number): 1 for number in range(4)}

@@ -258,7 +258,7 @@ class Stepped:
         for number, calibration in enumerate(cameras(SCALE)):
             self._write(ONLINE, words.camera_entity(number), words.CALIBRATION, calibration)
         self._write(ONLINE, words.WORKSPACE, words.EMPTY, self.clock.wall_ns())
-        while len(online.survey(words.CAMERAS, ("background",))) < words.CAMERA_COUNT:
+        while len(online.list_slots(words.CAMERAS, ("background",))) < words.CAMERA_COUNT:
             self.tick()
         start_ns = self.clock.wall_ns() - round(begin_s * 1e9)
         playing = words.Playing(
@@ -285,7 +285,7 @@ class Stepped:
         """Keep what a recording would have."""
         for world in (ONLINE, TRUTH):
             context = self.cell.world(world)
-            for info in context.survey("**", RECORDED):
+            for info in context.list_slots("**", RECORDED):
                 slot = world, info.entity.name, info.aspect
                 if info.null_reason or self._newest.get(slot) == info.version:
                     continue

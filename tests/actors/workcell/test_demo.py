@@ -132,7 +132,7 @@ def test_set_up_writes_what_is_known_and_lets_nothing_play():
     with testing.worlds("online", "truth") as cell:
         testing.run_once(Setup("S2", 3, 12.0), cell)
         online, truth = cell.world("online"), cell.world("truth")
-        assert len(online.survey(words.CAMERAS, ("calibration",))) == words.CAMERA_COUNT
+        assert len(online.list_slots(words.CAMERAS, ("calibration",))) == words.CAMERA_COUNT
         assert online.history(words.WORKSPACE, words.EMPTY) == ()
         playing = truth.history(words.SCENARIO, words.PLAYING)[0].datum()
         assert (playing.scenario, playing.seed, playing.seconds) == ("S2", 3, 12.0)
@@ -231,7 +231,7 @@ def test_a_stop_leads_to_the_images_that_were_committed_with_its_masks(tmp_path)
         conductor._keep_stop()
 
         assert set(stop_checks(conductor.notes).values()) == {True}
-        kept = [str(one.aspect) for one in cell.kept()["first-stop"]]
+        kept = [str(one.aspect) for one in cell.pinned()["first-stop"]]
         assert kept.count("image") == kept.count("silhouette") == 2
 
 
@@ -306,7 +306,7 @@ def test_the_nearest_approach_is_shown_when_hulls_of_its_time_are_forgotten(caps
             online.history(entity, aspect, count=1)[0]
             for entity, aspect in ((words.WORKSPACE, words.HULL), (words.ROBOT, words.SPEED))
         ]
-        cell.keep("nearest", near)
+        cell.pin("nearest", near)
         for stamp_ns in range(3, 130):
             put_hull_and_speed(online, (), stamp_ns)
 
