@@ -14,16 +14,16 @@ from enact_dist.core.protocol.datum import Slot
 from enact_dist.core.protocol.messages import AwaitStamp, Reached, Survey, Surveyed
 from enact_dist.core.protocol.placement import shard_of
 from enact_dist.terms import Access
-from enact_dist.verify.simulation.client_host import Calls, ClientHost, Steps
-from enact_dist.verify.simulation.world import MS
+from enact_dist.verify.simulation.hosts.client_host import Calls, ClientHost, Steps
+from enact_dist.verify.simulation.hosts.world import MS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
     from random import Random
 
     from enact_dist.core.protocol.messages import Item
-    from enact_dist.verify.simulation.model import Model
-    from enact_dist.verify.simulation.world import World
+    from enact_dist.verify.simulation.hosts.world import World
+    from enact_dist.verify.simulation.judges.model import Model
 
 TICK_NS: Final = 1500 * MS
 """Data of one tick bear one stamp: about as long as a few slots take to be written once."""

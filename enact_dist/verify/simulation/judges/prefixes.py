@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 
 from enact_dist.core.shard.shard import Shard
 from enact_dist.terms import Durability
-from enact_dist.verify.simulation.history import conflict
+from enact_dist.verify.simulation.judges.history import conflict
 
 if TYPE_CHECKING:
     from enact_dist.core.protocol.datum import Slot
     from enact_dist.core.protocol.records import Recovered
-    from enact_dist.verify.simulation.picture import Picture
-    from enact_dist.verify.simulation.shard_host import ShardHost
+    from enact_dist.verify.simulation.hosts.shard_host import ShardHost
+    from enact_dist.verify.simulation.judges.picture import Picture
 
 
 def judge_prefixes(

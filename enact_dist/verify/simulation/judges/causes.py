@@ -14,10 +14,10 @@ if TYPE_CHECKING:
 
     from enact_dist.core.protocol.messages import Notice
     from enact_dist.core.protocol.records import Content
-    from enact_dist.verify.simulation.history import Entry, History
-    from enact_dist.verify.simulation.picture import Picture
-    from enact_dist.verify.simulation.shard_host import ShardHost
-    from enact_dist.verify.simulation.world import World
+    from enact_dist.verify.simulation.hosts.shard_host import ShardHost
+    from enact_dist.verify.simulation.hosts.world import World
+    from enact_dist.verify.simulation.judges.history import Entry, History
+    from enact_dist.verify.simulation.judges.picture import Picture
 
 DRIFT: Final = 1.02
 """How much faster than true time a shard's clock may run."""

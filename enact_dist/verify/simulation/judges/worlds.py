@@ -12,8 +12,8 @@ from enact_dist.core.protocol.messages import DatumRead, Dropped, Forked, WorldE
 from enact_dist.core.protocol.parts import CAUSE_FORK
 from enact_dist.core.protocol.records import Reply, WorldDropped, WorldRecord
 from enact_dist.terms import Durability
-from enact_dist.verify.simulation.payloads import copied
-from enact_dist.verify.simulation.picture import DROP, NEVER_SET, State
+from enact_dist.verify.simulation.hosts.payloads import copied
+from enact_dist.verify.simulation.judges.picture import DROP, NEVER_SET, State
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -21,17 +21,17 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.datum import Slot
     from enact_dist.core.protocol.messages import Notice
     from enact_dist.core.protocol.records import Content, Effect, Recovered
-    from enact_dist.verify.simulation.model import Model
-    from enact_dist.verify.simulation.picture import Picture
-    from enact_dist.verify.simulation.shard_host import ShardHost
+    from enact_dist.verify.simulation.hosts.shard_host import ShardHost
+    from enact_dist.verify.simulation.judges.history import Observations
+    from enact_dist.verify.simulation.judges.picture import Picture
 
 
 class WorldJudge:
     """Looks at the world contexts of shards that were forked from others."""
 
-    def __init__(self, model: Model) -> None:
-        self._model = model
-        self._fail = model.fail
+    def __init__(self, observed: Observations) -> None:
+        self._observed = observed
+        self._fail = observed.fail
         self._to_tell: dict[Slot, tuple[int, bool]] = {}
 
     # ---------------------------------------------------------------- one step of a shard
@@ -80,8 +80,8 @@ class WorldJudge:
             self._put(slot, content, world, picture)
             self._to_tell[slot] = (content.version, content.datum is None)
         self._enter(world, picture)
-        self._model.count("worlds forked", 1)
-        self._model.count("slots forked", len(found))
+        self._observed.count("worlds forked", 1)
+        self._observed.count("slots forked", len(found))
 
     def _check_slot(
         self,
@@ -110,7 +110,7 @@ class WorldJudge:
         picture.put(slot, state)
 
     def _enter(self, world: WorldEntry, picture: Picture) -> None:
-        now_ns = self._model.now_ns
+        now_ns = self._observed.world.now_ns
         picture.worlds[world.name] = world
         picture.restarts.append((_writer(world), now_ns, now_ns))
 
@@ -131,10 +131,10 @@ class WorldJudge:
                 if state.datum is not None:
                     self._to_tell[slot] = (state.version + 1, True)
             self._gone(record, picture)
-            self._model.count("worlds dropped", 1)
+            self._observed.count("worlds dropped", 1)
 
     def _gone(self, record: WorldDropped, picture: Picture) -> None:
-        now_ns = self._model.now_ns
+        now_ns = self._observed.world.now_ns
         writer = DROP + _writer(picture.worlds.pop(record.name))
         for slot, state in _of_context(picture, record.name):
             told = state.version + (state.datum is not None)
@@ -158,18 +158,18 @@ class WorldJudge:
             acts = (r for r in newest if isinstance(r, WorldRecord | WorldDropped))
             if dropped.get(name) != next((r for r in acts if r.name == name), None):
                 self._fail("a fork survives", host.name, world)
-            self._model.count("drops found after a crash", 1)
+            self._observed.count("drops found after a crash", 1)
             self._gone(dropped[name], picture)
         for name, world in forks.items():
             if name not in picture.worlds:
-                self._model.count("forks found after a crash", 1)
+                self._observed.count("forks found after a crash", 1)
                 self._found(host, world, picture)
 
     def _found(self, host: ShardHost, world: WorldEntry, picture: Picture) -> None:
         """A fork that the disk was working on is there after all, but for what is volatile."""
         wanted = _as_of(picture, world)
         for slot, content in host.shard.state.slots.of_context(world.name):
-            durability = self._model.durabilities[slot.aspect]
+            durability = self._observed.durabilities[slot.aspect]
             if durability is not Durability.VOLATILE:
                 self._check_slot(slot, content, wanted.get(slot, NEVER_SET), world, picture)
                 self._put(slot, content, world, picture)

@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.core.protocol.messages import Granted, Survey, Viewed
 from enact_dist.patterns import pattern_matches
 from enact_dist.terms import Access, NullReason
-from enact_dist.verify.simulation.picture import State
+from enact_dist.verify.simulation.judges.picture import State
 
 if TYPE_CHECKING:
     from enact_dist.core.protocol.datum import Datum, Slot
     from enact_dist.core.protocol.messages import Item, SlotState, Surveyed
-    from enact_dist.verify.simulation.model import Model
-    from enact_dist.verify.simulation.picture import Picture
-    from enact_dist.verify.simulation.shard_host import ShardHost
+    from enact_dist.verify.simulation.hosts.shard_host import ShardHost
+    from enact_dist.verify.simulation.judges.history import Observations
+    from enact_dist.verify.simulation.judges.picture import Picture
 
 OUTSIDE: Final = State(0, 0, "nobody", 0, None)
 """What stands for a version that is not retained."""
@@ -29,18 +29,18 @@ class ReaderJudge:
     """Looks at grants, views and surveys.
 
     Args:
-        model: Whom to tell.
+        observed: What is known of the run.
         retentions: How many versions of a slot stay readable, by aspect.
     """
 
-    def __init__(self, model: Model, retentions: dict[str, int]) -> None:
-        self._model = model
-        self._fail = model.fail
+    def __init__(self, observed: Observations, retentions: dict[str, int]) -> None:
+        self._observed = observed
+        self._fail = observed.fail
         self._retentions = retentions
 
     def check(self, host: ShardHost, answer: Granted | Viewed, picture: Picture) -> None:
         """I18: an answer shows one committed moment, and all of it."""
-        entry = self._model.entry(answer.lock)
+        entry = self._observed.entry(answer.lock)
         items = entry.items if entry is not None else ()
         asked = {i[1:4]: i.captured_ns for i in items if i.captured_ns}
         for state in answer.states:
@@ -63,11 +63,11 @@ class ReaderJudge:
         name = (state.version, state.stamp_ns)
         if name != now.name and isinstance(answer, Viewed):
             now = picture.at(state.slot, max(answer.from_ns, answer.until_ns))
-            self._model.count("data shown as of the past", 1)
+            self._observed.count("data shown as of the past", 1)
             if name != now.name and answer.from_ns > answer.until_ns:
                 # Of no one moment, and it says so: some of the past was forgotten.
                 now = picture.at(state.slot, answer.until_ns)
-                self._model.count("views of no moment", 1)
+                self._observed.count("views of no moment", 1)
         if name != now.name:
             self._fail("I18 readers see what is committed", state.slot, state, now)
         if (state.null_reason == "") != (now.datum is not None):
@@ -95,16 +95,16 @@ class ReaderJudge:
             no_moment = answer.from_ns > answer.until_ns
             moments = [*moments, at_begin, at_end] if no_moment else [at_end]
         right = [self._captured(picture, slot, newest, captured_ns) for newest in moments]
-        right += [OUTSIDE] * self._model.clocks_were_set  # it may have grown old in one leap
+        right += [OUTSIDE] * self._observed.clocks_were_set  # it may have grown old in one leap
         if not any(_is_shown(state, one) for one in right):
             self._fail("a capture stamp shows its own version", state, captured_ns, right)
         newest = picture.now(slot)
         if state.null_reason == NullReason.OUTSIDE_RETENTION.name:
-            self._model.count("stamps outside retention", 1)
+            self._observed.count("stamps outside retention", 1)
         elif not state.null_reason and (state.version, state.stamp_ns) != newest.name:
-            self._model.count("replaced versions shown by stamp", 1)
+            self._observed.count("replaced versions shown by stamp", 1)
         if moments[-1] is not newest:
-            self._model.count("stamped views of the past", 1)
+            self._observed.count("stamped views of the past", 1)
 
     def _captured(self, picture: Picture, slot: Slot, newest: State, captured_ns: int) -> State:
         """Return what a slot that is at `newest` has to show for a capture stamp."""
@@ -120,7 +120,7 @@ class ReaderJudge:
 
         A restart leaves what is on the disk, and of volatile slots nothing.
         """
-        line = picture.line(slot, volatile=self._model.is_volatile(slot))
+        line = picture.line(slot, volatile=self._observed.is_volatile(slot))
         return line[-self._retentions[slot.aspect] : -1]
 
     def check_survey(self, message: Survey, answer: Surveyed, picture: Picture) -> None:
@@ -136,10 +136,10 @@ class ReaderJudge:
             found = [(s.version, s.stamp_ns, s.captured_ns) for s in told.pop(slot, ())]
             if not found and right == [(0, 0, 0)]:
                 continue  # the only write that it had is gone, as declared
-            grew_old = self._model.clocks_were_set and found and found == right[-len(found) :]
+            grew_old = self._observed.clocks_were_set and found and found == right[-len(found) :]
             if found != right and not grew_old:
                 self._fail("a survey names what is retained", slot, found, right)
-            self._model.count("replaced versions surveyed", len(retained))
+            self._observed.count("replaced versions surveyed", len(retained))
         for slot, states in told.items():
             # A slot of class `volatile` whose first write came to nothing is known to exist.
             if any((s.version, s.stamp_ns, s.captured_ns) != (0, 0, 0) for s in states):
@@ -162,7 +162,7 @@ class ReaderJudge:
 
     def _check_patterns_of_grant(self, host: ShardHost, answer: Granted, picture: Picture) -> None:
         shown = {state.slot for state in answer.states}
-        absent = self._model.absent.setdefault(answer.lock, {})
+        absent = self._observed.absent.setdefault(answer.lock, {})
         for known in [known for known in absent if known[0] == host.name]:
             del absent[known]  # of an earlier grant, before a restart
         tenure = host.shard.state.tenures.by_lock.get(answer.lock)

@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.datum import Datum, Slot
     from enact_dist.core.protocol.messages import AspectEntry
     from enact_dist.core.protocol.records import Effect
-    from enact_dist.verify.simulation.client_host import ClientHost
-    from enact_dist.verify.simulation.history import Entry
-    from enact_dist.verify.simulation.picture import Picture
-    from enact_dist.verify.simulation.shard_host import ShardHost
-    from enact_dist.verify.simulation.world import World
+    from enact_dist.verify.simulation.hosts.client_host import ClientHost
+    from enact_dist.verify.simulation.hosts.shard_host import ShardHost
+    from enact_dist.verify.simulation.hosts.world import World
+    from enact_dist.verify.simulation.judges.history import Entry
+    from enact_dist.verify.simulation.judges.picture import Picture
 
 OLDER: Final = "Number{value:int}"
 NEWER: Final = "Number{value:int,unit:str=}"

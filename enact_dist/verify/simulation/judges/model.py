@@ -45,78 +45,46 @@ from enact_dist.core.protocol.records import (
 )
 from enact_dist.core.state.retention import limits_of
 from enact_dist.terms import Durability
-from enact_dist.verify.simulation.cause_judge import CauseJudge
-from enact_dist.verify.simulation.client_judge import ClientJudge
-from enact_dist.verify.simulation.growth_judge import GrowthJudge
-from enact_dist.verify.simulation.history import TOLD_NOT, History
-from enact_dist.verify.simulation.lock_judge import LockJudge
-from enact_dist.verify.simulation.past_judge import PastJudge
-from enact_dist.verify.simulation.payloads import copied
-from enact_dist.verify.simulation.picture import Picture, State
-from enact_dist.verify.simulation.prefixes import judge_prefixes
-from enact_dist.verify.simulation.reader_judge import ReaderJudge, stamp_of
-from enact_dist.verify.simulation.workload import FILLED, label_of, value_of, writer_of
-from enact_dist.verify.simulation.world_judge import WorldJudge
+from enact_dist.verify.simulation.data import FILLED, label_of, value_of, writer_of
+from enact_dist.verify.simulation.hosts.payloads import copied
+from enact_dist.verify.simulation.judges.causes import CauseJudge
+from enact_dist.verify.simulation.judges.clients import ClientJudge
+from enact_dist.verify.simulation.judges.growth import GrowthJudge
+from enact_dist.verify.simulation.judges.history import TOLD_NOT, Observations
+from enact_dist.verify.simulation.judges.locks import LockJudge
+from enact_dist.verify.simulation.judges.past import PastJudge
+from enact_dist.verify.simulation.judges.picture import Picture, State
+from enact_dist.verify.simulation.judges.prefixes import judge_prefixes
+from enact_dist.verify.simulation.judges.readers import ReaderJudge, stamp_of
+from enact_dist.verify.simulation.judges.worlds import WorldJudge
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from enact_dist.core.protocol.messages import AspectEntry
     from enact_dist.core.protocol.records import Effect
-    from enact_dist.verify.simulation.history import Entry
-    from enact_dist.verify.simulation.shard_host import ShardHost
-    from enact_dist.verify.simulation.world import World
+    from enact_dist.verify.simulation.hosts.shard_host import ShardHost
+    from enact_dist.verify.simulation.hosts.world import World
+    from enact_dist.verify.simulation.judges.history import History
 
 
-class Model:
+class Model(Observations):
     """The judge of a running simulation."""
 
     def __init__(self, world: World, history: History, aspects: Iterable[AspectEntry]) -> None:
-        self._world, self._history = world, history
+        aspects = tuple(aspects)
+        super().__init__(
+            world, history, {entry.name: Durability(entry.durability) for entry in aspects}
+        )
+        versions = {entry.name: limits_of(entry).versions for entry in aspects}
+        self.growth = GrowthJudge(world)
+        self.of_clients = ClientJudge(self, self.growth)
+        self.labels: dict[tuple[str, str], Slot] = {}
         self._locks = LockJudge(world)
         self._causes = CauseJudge(world, history)
-        aspects = tuple(aspects)
-        self.durabilities = {entry.name: Durability(entry.durability) for entry in aspects}
-        versions = {entry.name: limits_of(entry).versions for entry in aspects}
         self._readers = ReaderJudge(self, versions)
         self._pasts = PastJudge(self, versions)
-        self.pictures: dict[str, Picture] = {}
-        self.of_clients = ClientJudge(world, history, self)
-        self.absent: dict[LockId, dict[tuple[str, Slot], tuple[int, tuple[int, int]]]] = {}
-        self.labels: dict[tuple[str, str], Slot] = {}
         self._worlds = WorldJudge(self)
-        self.growth = GrowthJudge(world)
-        self.permitted_losses: dict[LockId, None] = {}
-        self.decided: dict[LockId, DecisionRecord] = {}
-        self.clocks_were_set = False
-
-    def fail(self, rule: str, *facts: object) -> None:
-        """Stop the run: a rule is broken."""
-        self._fail(rule, *facts)
-
-    def is_volatile(self, slot: Slot) -> bool:
-        """Whether a restart loses the data of a slot."""
-        return self.durabilities[slot.aspect] is Durability.VOLATILE
-
-    def entry(self, lock: LockId) -> Entry | None:
-        """Return what a client knows of its lock."""
-        return self._history.entries.get(lock)
-
-    def clock_was_set(self) -> None:
-        """A wall clock was set: commits may be refused for it from now on."""
-        self.clocks_were_set = True
-
-    @property
-    def now_ns(self) -> int:
-        """True time."""
-        return self._world.now_ns
-
-    def count(self, name: str, number: int) -> None:
-        """Add to a tally of the run."""
-        self._world.tally[name] += number
-
-    def _fail(self, rule: str, *facts: object) -> None:
-        self._world.violation(rule, *facts)
 
     # ---------------------------------------------------------------- restart
 
@@ -133,14 +101,14 @@ class Model:
             if persist is None or id(persist) not in gone:
                 continue
             if not (power_cut and persist.durability is Durability.OS):
-                self._fail("I5 committed survives", lock, persist.durability, power_cut)
+                self.fail("I5 committed survives", lock, persist.durability, power_cut)
             self.permitted_losses[lock] = None
             losses[lock] = None
-            self._world.tally["commits lost as declared"] += 1
+            self.world.tally["commits lost as declared"] += 1
         self._check_promises(lost, picture)
         for lock, persist in picture.in_flight.items():
             if id(persist) not in gone:
-                self._world.tally["commits found after a crash"] += 1
+                self.world.tally["commits found after a crash"] += 1
                 self._found(host, lock, persist, picture)
         picture.in_flight.clear()
         picture.preparing.clear()
@@ -152,9 +120,9 @@ class Model:
         for persist in lost:
             for record in persist.records:
                 if isinstance(record, PreparedRecord) and record.lock in picture.prepared:
-                    self._fail("a promise survives", record.lock, persist.durability)
+                    self.fail("a promise survives", record.lock, persist.durability)
                 if isinstance(record, PreparedEnded) and record.lock in picture.applied:
-                    self._fail("an end of a promise survives", record.lock, persist.durability)
+                    self.fail("an end of a promise survives", record.lock, persist.durability)
 
     def _found(self, host: ShardHost, lock: LockId, persist: Persist, picture: Picture) -> None:
         """What was under way at a crash turned out to be on disk."""
@@ -174,10 +142,10 @@ class Model:
         """A shard started: what it recovered becomes one writer of all slots in the history."""
         picture = self.pictures.setdefault(host.name, Picture())
         if recovered.epoch <= picture.epoch:
-            self._fail("epochs grow", recovered.epoch, picture.epoch)
+            self.fail("epochs grow", recovered.epoch, picture.epoch)
         picture.epoch = recovered.epoch
         writer = f"restart {recovered.epoch} of {host.name}"
-        picture.restarts.append((writer, crashed_at_ns, self._world.now_ns))
+        picture.restarts.append((writer, crashed_at_ns, self.world.now_ns))
         self._worlds.booted(host, recovered, picture)
         picture.vanished = frozenset(picture.chains) - {record.slot for record in recovered.slots}
         found = {record.slot: record for record in recovered.slots if not record.volatile}
@@ -187,33 +155,33 @@ class Model:
             name = (record.version, record.stamp_ns) if record else (0, 0)
             durability = self.durabilities[slot.aspect]
             if durability is Durability.DURABLE and name != before.name:
-                self._fail("I4 committed versions never regress", slot, name, before)
+                self.fail("I4 committed versions never regress", slot, name, before)
             if durability is Durability.OS and name not in _names(picture.chains[slot]):
-                self._fail("I19 only declared losses", slot, name)
+                self.fail("I19 only declared losses", slot, name)
             content = host.shard.state.slots[slot]
             if (content.version, content.stamp_ns) != name:
-                self._fail("I15 recovery is exact", slot, content, name)
+                self.fail("I15 recovery is exact", slot, content, name)
             if name != before.name:
                 # What is prepared here comes later, however early it was decided elsewhere.
                 by = f"{writer} under {prepared[slot]}" if slot in prepared else writer
                 picture.put(slot, State(*name, by, picture.epoch, content.datum))
             elif before.version and stamp_of(content.datum) != stamp_of(before.datum):
-                self._fail("a datum keeps its capture stamp", slot, content, before)
+                self.fail("a datum keeps its capture stamp", slot, content, before)
             picture.restarted_at[slot] = len(picture.chains[slot]) - 1
         self._causes.booted(host, picture)
         self.growth.booted(host, picture)
         self._pasts.booted(host, recovered, picture)
         if len(recovered.outcomes) > len(picture.lanes):
-            self._fail("I14 one outcome per lane", len(recovered.outcomes), len(picture.lanes))
+            self.fail("I14 one outcome per lane", len(recovered.outcomes), len(picture.lanes))
         picture.arrivals.clear()
         picture.granted.clear()
         picture.granted_ever.clear()
         for promise in recovered.prepared:
             lock = promise.lock
-            self._world.tally["prepared over a restart"] += 1
+            self.world.tally["prepared over a restart"] += 1
             tenure = host.shard.state.tenures.by_lock.get(lock)
             if tenure is None or tenure.token != promise.token or not tenure.claim.granted:
-                self._fail("I10 prepared locks are held again", lock)
+                self.fail("I10 prepared locks are held again", lock)
             picture.prepared[lock] = promise
             picture.granted[lock] = picture.granted_ever[lock] = promise.token
             picture.arrivals[lock] = 0
@@ -280,7 +248,7 @@ class Model:
                 assert isinstance(effect.notice, Notice)
                 picture.notices += 1
                 if effect.notice.number != picture.notices:
-                    self._fail("notices have no gap", effect.notice.number, picture.notices)
+                    self.fail("notices have no gap", effect.notice.number, picture.notices)
                 committed = told.get(effect.notice.changes[0].stamp_ns)
                 if self._worlds.explains(effect.notice):
                     continue
@@ -303,24 +271,24 @@ class Model:
                     if record.lock not in self.pictures[shard].applied
                 ]
                 if left:
-                    self._fail("a decision is kept until all have applied it", record.lock, left)
+                    self.fail("a decision is kept until all have applied it", record.lock, left)
             elif isinstance(record, PreparedEnded) and persist.ticket:
                 picture.in_flight[record.lock] = persist
             elif isinstance(record, PreparedEnded):
-                self._world.tally["prepared and aborted"] += 1
+                self.world.tally["prepared and aborted"] += 1
                 picture.aborted[record.lock] = None
                 picture.prepared.pop(record.lock, None)
                 if record.lock in self.decided:
-                    self._fail("I9 committed and aborted", record.lock)
+                    self.fail("I9 committed and aborted", record.lock)
                 if record.lock in picture.applied:
-                    self._fail("I9 applied and aborted", record.lock)
+                    self.fail("I9 applied and aborted", record.lock)
 
     def _check_prepared(self, host: ShardHost, answer: Prepared, picture: Picture) -> None:
         record = picture.preparing.pop(answer.lock, None)
         if record is not None:
             picture.prepared[answer.lock] = record
         if answer.lock not in picture.prepared and answer.lock not in picture.in_flight:
-            self._fail("prepared what was not asked", answer)
+            self.fail("prepared what was not asked", answer)
         picture.confirmed[answer.lock] = picture.prepared[answer.lock].token
         on_disk = host.disk.log[: host.disk.synced]
         if not any(
@@ -328,7 +296,7 @@ class Model:
             for persist in reversed(on_disk)
             for r in persist.records
         ):
-            self._fail("a promise is on disk before it is given", answer)
+            self.fail("a promise is on disk before it is given", answer)
 
     def _check_end_told(self, host: ShardHost, lock: LockId, picture: Picture) -> None:
         """Once a participant reports the end, the primary may forget the decision."""
@@ -336,7 +304,7 @@ class Model:
         if persist is not None and not any(
             kept is persist for kept in reversed(host.disk.log[: host.disk.synced])
         ):
-            self._fail("an end is on disk before it is told", lock)
+            self.fail("an end is on disk before it is told", lock)
 
     def _finished(self, host: ShardHost, notice: Notice, picture: Picture) -> None:
         """A participant has applied what it had prepared."""
@@ -345,12 +313,12 @@ class Model:
             if lock in picture.in_flight and {w.slot for w in record.writes} == slots:
                 break
         else:
-            self._fail("only what is prepared is finished", notice)
+            self.fail("only what is prepared is finished", notice)
             return
         if lock not in self.decided:
-            self._fail("I9 applied without a decision", lock)
+            self.fail("I9 applied without a decision", lock)
         versions = [SlotVersion(change.slot, change.version) for change in notice.changes]
-        self._world.tally["commits finished by participants"] += 1
+        self.world.tally["commits finished by participants"] += 1
         self._applied(host, lock, versions, notice, picture)
         del picture.prepared[lock]
 
@@ -366,34 +334,34 @@ class Model:
         persist = picture.in_flight.pop(lock, None)
         self._check_on_disk(host, lock, persist, notice)
         if picture.granted.get(lock) is None:
-            self._fail("the fence: only a holder commits", lock)
+            self.fail("the fence: only a holder commits", lock)
         if [(c.slot, c.version) for c in notice.changes] != expected:
-            self._fail("a notice tells what was committed", notice, expected)
+            self.fail("a notice tells what was committed", notice, expected)
         for record in persist.records if persist is not None else ():
             if isinstance(record, DecisionRecord):
                 self.decided[lock] = record
-                self._world.tally["decisions"] += 1
+                self.world.tally["decisions"] += 1
         versions = {change.slot: (change.version, change.stamp_ns) for change in notice.changes}
         datum_of = {slot: copied(host.shard.state.slots[slot].datum) for slot in versions}
         for change in notice.changes:
             datum = datum_of[change.slot]
             if (change.null, change.captured_ns) != (datum is None, stamp_of(datum)):
-                self._fail("a notice tells what was committed", change, datum)
+                self.fail("a notice tells what was committed", change, datum)
         self._put_all(lock, versions, picture, datum_of)
         picture.applied[lock] = persist
         picture.confirmed[lock] = picture.granted_ever[lock]
         self._causes.applied(host, lock, notice)
-        self._world.tally["commits"] += 1
+        self.world.tally["commits"] += 1
 
     def check_all_or_nothing(self) -> None:
         """I3: in the end a lock has its effects on all of its shards or on none."""
         for lock, record in self.decided.items():
             for shard in record.participants:
                 if lock not in self.pictures[shard].applied:
-                    self._fail("I3 decided, but not applied", lock, shard)
+                    self.fail("I3 decided, but not applied", lock, shard)
         for name, picture in self.pictures.items():
             if picture.prepared:
-                self._fail("I12 nothing stays prepared", name, list(picture.prepared))
+                self.fail("I12 nothing stays prepared", name, list(picture.prepared))
 
     def _check_on_disk(
         self, host: ShardHost, lock: LockId, persist: Persist | None, notice: Notice
@@ -404,7 +372,7 @@ class Model:
         kept = host.disk.synced if Durability.DURABLE in strictest else host.disk.written
         log = host.disk.log
         if persist is None or not any(log[i] is persist for i in range(kept - 1, -1, -1)):
-            self._fail("P5 on disk before it is told", lock, strictest)
+            self.fail("P5 on disk before it is told", lock, strictest)
 
     def _apply(
         self,
@@ -422,7 +390,7 @@ class Model:
         self._put_all(lock, versions, picture, datum_of)
         picture.applied[lock] = persist
         picture.confirmed[lock] = picture.granted_ever[lock]
-        self._world.tally["commits"] += 1
+        self.world.tally["commits"] += 1
 
     def _put_all(
         self,
@@ -432,18 +400,18 @@ class Model:
         datum_of: dict[Slot, Datum | None],
     ) -> None:
         if lock in picture.applied:
-            self._fail("I16 one execution per lock", lock)
-        entry = self._history.entries.get(lock)
+            self.fail("I16 one execution per lock", lock)
+        entry = self.history.entries.get(lock)
         if entry is not None and entry.told in TOLD_NOT:
-            self._fail("I5 told not committed, then visible", lock, entry.told)
+            self.fail("I5 told not committed, then visible", lock, entry.told)
         for slot, (version, stamp_ns) in versions.items():
             before, datum = picture.now(slot), datum_of.get(slot)
             if version != picture.next_version(slot):
-                self._fail("I2 versions are a chain", slot, version, before)
+                self.fail("I2 versions are a chain", slot, version, before)
             if before.epoch == picture.epoch and stamp_ns <= before.stamp_ns:
-                self._fail("stamps grow", slot, stamp_ns, before)
+                self.fail("stamps grow", slot, stamp_ns, before)
             if stamp_ns <= picture.promised.get(slot, 0):
-                self._fail("the past does not change", slot, stamp_ns, picture.promised[slot])
+                self.fail("the past does not change", slot, stamp_ns, picture.promised[slot])
             if entry is not None:
                 self.growth.committed(entry, slot, before.datum, datum, picture)
             if datum is not None:
@@ -452,18 +420,18 @@ class Model:
 
     def _check_content(self, lock: LockId, slot: Slot, before: State, datum: Datum) -> None:
         if writer_of(datum) != str(lock):
-            self._fail("a commit publishes its own data", slot, datum)
+            self.fail("a commit publishes its own data", slot, datum)
         if len(datum.body) != datum.size or bytes(datum.body[FILLED:]).strip(b"."):
-            self._fail("no half datum is ever shown", slot, datum.size, len(datum.body))
+            self.fail("no half datum is ever shown", slot, datum.size, len(datum.body))
         if slot.aspect == "made":
             first = self.labels.setdefault((slot.context, label_of(datum)), slot)
             if first != slot:
-                self._fail("no phantom: two created one thing", first, slot, label_of(datum))
+                self.fail("no phantom: two created one thing", first, slot, label_of(datum))
             return
         old = 0 if before.datum is None else value_of(before.datum)
         emptied = self.durabilities[slot.aspect] is Durability.VOLATILE and before.version == 0
         if value_of(datum) != old + 1 and not (emptied and lock in self.decided):
-            self._fail("no lost update", slot, old, datum)
+            self.fail("no lost update", slot, old, datum)
 
 
 def _names(chain: list[State]) -> set[tuple[int, int]]:

@@ -24,21 +24,23 @@ from enact_dist.core.protocol.messages import (
 )
 from enact_dist.core.protocol.placement import shard_of
 from enact_dist.terms import Access
-from enact_dist.verify.simulation.captures import Captures, drawn_stamp_ns
-from enact_dist.verify.simulation.cause_judge import reads_of
 from enact_dist.verify.simulation.cells import CONTEXTS
-from enact_dist.verify.simulation.client_host import Calls, ClientHost, Sleep, Steps, Thread
-from enact_dist.verify.simulation.growth import ATTEMPTS_MAX, Growth
-from enact_dist.verify.simulation.growth_judge import OLDER
-from enact_dist.verify.simulation.history import Entry, History
-from enact_dist.verify.simulation.payloads import DRAFT_NS, Stager
-from enact_dist.verify.simulation.world import MS, S
+from enact_dist.verify.simulation.data import datum_of, label_of, value_of
+from enact_dist.verify.simulation.hosts.client_host import Calls, ClientHost, Sleep, Steps, Thread
+from enact_dist.verify.simulation.hosts.payloads import DRAFT_NS
+from enact_dist.verify.simulation.hosts.world import MS, S
+from enact_dist.verify.simulation.judges.causes import reads_of
+from enact_dist.verify.simulation.judges.growth import OLDER
+from enact_dist.verify.simulation.judges.history import Entry, History
+from enact_dist.verify.simulation.work.captures import Captures, drawn_stamp_ns
+from enact_dist.verify.simulation.work.growth import ATTEMPTS_MAX, Growth
+from enact_dist.verify.simulation.work.staging import Stager
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from enact_dist.verify.simulation.model import Model
-    from enact_dist.verify.simulation.world import World
+    from enact_dist.verify.simulation.hosts.world import World
+    from enact_dist.verify.simulation.judges.model import Model
 
 ASPECTS = (
     AspectEntry("count", OLDER, "durable", 6),
@@ -72,8 +74,6 @@ LARGE = 64 * 1024 + 1
 """Bytes of a datum that does not travel with the grant."""
 WORKS_NS = tuple(ms * MS for ms in (0, 0, 0, 0, 2, 20, 20, 100, 100, 500, 2000))
 """How long a lock may be held before it ends."""
-FILLED = 200
-"""A datum says what it is in fewer bytes; from here on it is filled with dots."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -423,24 +423,3 @@ def told_of(item: Item) -> str:
     """Return an item as a story shows it."""
     access = Access(item.access).name.lower().replace("_", " ")
     return f"{access} {item.context}/{item.entity}/{item.aspect}"
-
-
-def datum_of(text: str, *, size: int = 0) -> Datum:
-    """Return a datum that says who wrote it and what."""
-    body = text.encode().ljust(size, b".")
-    return Datum(b"text", body, len(body))
-
-
-def writer_of(datum: Datum) -> str:
-    """Return the lock that wrote a datum."""
-    return bytes(datum.body[:FILLED]).decode().partition("|")[0]
-
-
-def value_of(datum: Datum) -> int:
-    """Return the number in a datum."""
-    return int(bytes(datum.body[:FILLED]).decode().rstrip(".").partition("|")[2])
-
-
-def label_of(datum: Datum) -> str:
-    """Return the label in a datum."""
-    return bytes(datum.body[:FILLED]).decode().rstrip(".").partition("|")[2]

@@ -19,29 +19,28 @@ from enact_dist.verify.checker import (
     State,
     Told,
 )
-from enact_dist.verify.simulation.history import TOLD_NOT
-from enact_dist.verify.simulation.picture import DROP, NEVER_SET
-from enact_dist.verify.simulation.reader_judge import stamp_of
+from enact_dist.verify.simulation.judges.history import TOLD_NOT
+from enact_dist.verify.simulation.judges.picture import DROP, NEVER_SET
+from enact_dist.verify.simulation.judges.readers import stamp_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from enact_dist.core.client import plan as lock_parts
     from enact_dist.core.protocol.datum import Slot
-    from enact_dist.verify.simulation.history import Entry, History
-    from enact_dist.verify.simulation.model import Model
+    from enact_dist.verify.simulation.judges.history import Entry, History, Observations
 
 
 class Graph:
     """Everything that committed in a simulated run, and in which order it can have done so."""
 
-    def __init__(self, history: History, model: Model) -> None:
-        self._model = model
+    def __init__(self, history: History, observed: Observations) -> None:
+        self._observed = observed
         self._positions: dict[Slot, dict[tuple[int, int], list[tuple[int, int]]]] = {}
         self._drops: dict[Slot, list[tuple[str, int]]] = {}
         self._events: dict[str, tuple[int, int]] = {}
         chains: dict[Slot, list[State]] = {}
-        for picture in model.pictures.values():
+        for picture in observed.pictures.values():
             for slot, chain in picture.chains.items():
                 chains[slot] = [
                     State(i, s.writer, s.version, stamp_of(s.datum)) for i, s in enumerate(chain)
@@ -52,7 +51,7 @@ class Graph:
                         self._drops.setdefault(slot, []).append((str(state.writer), index))
                     else:
                         positions.setdefault(state.name, []).append((state.epoch, index))
-        pictures = model.pictures.values()
+        pictures = observed.pictures.values()
         events = self._events
         for writer, begun_ns, ended_ns in (one for picture in pictures for one in picture.restarts):
             begun, ended = events.get(writer, (begun_ns, ended_ns))  # a fork is on several shards
@@ -61,13 +60,13 @@ class Graph:
             map(self._story, history.entries.values()),
             chains,
             events=events,
-            lost=model.permitted_losses,
+            lost=observed.permitted_losses,
             applied={lock for picture in pictures for lock in picture.applied},
         )
 
     def _story(self, entry: Entry) -> LockStory:
         reads = self._readings(entry, entry.readings())
-        for (_, slot), (epoch, name) in self._model.absent.get(entry.id, {}).items():
+        for (_, slot), (epoch, name) in self._observed.absent.get(entry.id, {}).items():
             reads.append(Reading(slot, self._position(entry, slot, epoch, name)))
         return LockStory(
             entry.id,
@@ -76,7 +75,7 @@ class Graph:
             _told(entry.told),
             reads,
             self._readings(entry, entry.views()),
-            outlives_restarts=entry.id in self._model.decided,
+            outlives_restarts=entry.id in self._observed.decided,
             captured=self._captured(entry),
         )
 
@@ -110,11 +109,11 @@ class Graph:
     def check_views(self) -> None:
         """Every view and every set shows all that a commit has written, or nothing of it."""
         for rule, facts in self._checker.view_anomalies():
-            self._model.fail(rule, *facts)
+            self._observed.fail(rule, *facts)
         for rule, facts in self._checker.set_anomalies():
-            self._model.fail(rule, *facts)
-        self._model.count("views over several slots checked", self._checker.views_checked)
-        self._model.count("sets of one stamp checked", self._checker.sets_checked)
+            self._observed.fail(rule, *facts)
+        self._observed.count("views over several slots checked", self._checker.views_checked)
+        self._observed.count("sets of one stamp checked", self._checker.sets_checked)
 
     def cycle(self) -> list[str] | None:
         """Return a cycle as lines to read, or None if there is an order."""

@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from enact_dist.verify.simulation.faults import Faults
+    from enact_dist.verify.simulation.hosts.world import Host, World
     from enact_dist.verify.simulation.schedule import Place
-    from enact_dist.verify.simulation.world import Host, World
 
-from enact_dist.verify.simulation.world import MS
+from enact_dist.verify.simulation.hosts.world import MS
 
 SomeMessage = TypeVar("SomeMessage", bound=m.Message)
 

@@ -24,18 +24,18 @@ from enact_dist.core.protocol.messages import (
 )
 from enact_dist.terms import Access
 from enact_dist.verify.simulation.cells import CONTEXTS
-from enact_dist.verify.simulation.client_host import Calls, Sleep, Steps
-from enact_dist.verify.simulation.workload import ENTITIES, PLAIN, Job
-from enact_dist.verify.simulation.world import MS, S
+from enact_dist.verify.simulation.hosts.client_host import Calls, Sleep, Steps
+from enact_dist.verify.simulation.hosts.world import MS, S
+from enact_dist.verify.simulation.work.workload import ENTITIES, PLAIN, Job
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from enact_dist.core.protocol.messages import Answer, Request
-    from enact_dist.verify.simulation.client_host import ClientHost, Thread
-    from enact_dist.verify.simulation.model import Model
-    from enact_dist.verify.simulation.workload import Workload
-    from enact_dist.verify.simulation.world import World
+    from enact_dist.verify.simulation.hosts.client_host import ClientHost, Thread
+    from enact_dist.verify.simulation.hosts.world import World
+    from enact_dist.verify.simulation.judges.model import Model
+    from enact_dist.verify.simulation.work.workload import Workload
 
     _Make = Callable[[int, int], Fork | DropWorld]
     _Answered = Steps[Answer | None]

@@ -12,20 +12,20 @@ from enact_dist.core.client.plan import Phase
 from enact_dist.core.protocol.messages import Item, KeepVersions, ListHistory, SlotVersion, Versions
 from enact_dist.terms import Access
 from enact_dist.verify.simulation.cells import CONTEXTS
-from enact_dist.verify.simulation.client_host import Calls, Sleep
-from enact_dist.verify.simulation.history import Entry
-from enact_dist.verify.simulation.workload import ENTITIES, PLAIN
-from enact_dist.verify.simulation.world import MS, S
+from enact_dist.verify.simulation.hosts.client_host import Calls, Sleep
+from enact_dist.verify.simulation.hosts.world import MS, S
+from enact_dist.verify.simulation.judges.history import Entry
+from enact_dist.verify.simulation.work.workload import ENTITIES, PLAIN
 
 if TYPE_CHECKING:
     from random import Random
 
     from enact_dist.core.protocol.messages import VersionEntry
-    from enact_dist.verify.simulation.client_host import ClientHost, Steps, Thread
-    from enact_dist.verify.simulation.history import History
-    from enact_dist.verify.simulation.model import Model
-    from enact_dist.verify.simulation.workload import Workload
-    from enact_dist.verify.simulation.world import World
+    from enact_dist.verify.simulation.hosts.client_host import ClientHost, Steps, Thread
+    from enact_dist.verify.simulation.hosts.world import World
+    from enact_dist.verify.simulation.judges.history import History
+    from enact_dist.verify.simulation.judges.model import Model
+    from enact_dist.verify.simulation.work.workload import Workload
 
 SHARE: Final = 0.5
 """Share of the runs in which a client views the past."""

@@ -24,7 +24,7 @@ from enact_dist.core.protocol.messages import (
     Request,
 )
 from enact_dist.link.client.catalogue import CATALOGUES, KnownCatalogue
-from enact_dist.verify.simulation.world import MS, Host, S
+from enact_dist.verify.simulation.hosts.world import MS, Host, S
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -32,10 +32,9 @@ if TYPE_CHECKING:
     from enact_dist.core.client.lock import MultiLock
     from enact_dist.core.protocol.datum import Datum, Slot
     from enact_dist.verify.simulation.faults import Faults
-    from enact_dist.verify.simulation.model import Model
-    from enact_dist.verify.simulation.network import Network
-    from enact_dist.verify.simulation.shard_host import ShardHost
-    from enact_dist.verify.simulation.world import World
+    from enact_dist.verify.simulation.hosts.network import Network
+    from enact_dist.verify.simulation.hosts.shard_host import ShardHost
+    from enact_dist.verify.simulation.hosts.world import World
 
 CALL_NS = S
 """How long a call may stay unanswered before its thread takes that for an answer."""
@@ -80,7 +79,7 @@ class ClientHost(Host):
         *,
         network: Network,
         shards: dict[str, ShardHost],
-        model: Model,
+        check_beliefs: Callable[[ClientHost], None],
         faults: Faults,
         ttl_ns: int,
     ) -> None:
@@ -94,7 +93,7 @@ class ClientHost(Host):
         self.own: dict[Slot, tuple[str, int, int]] = {}
         """Where and in which epoch it last committed a slot, and with which stamp."""
         self.threads_left = 0
-        self._network, self._shards, self._model = network, shards, model
+        self._network, self._shards, self._check_beliefs = network, shards, check_beliefs
         self._faults = faults
         self._calls: dict[int, _Call] = {}
         self._calls_made = 0
@@ -167,7 +166,7 @@ class ClientHost(Host):
             return
         del self._calls[number]
         call.take(answer)
-        self._model.of_clients.check_beliefs(self)
+        self._check_beliefs(self)
 
     def _time_is_up(self, number: int) -> None:
         call = self._calls.get(number)
@@ -196,7 +195,7 @@ class ClientHost(Host):
                 call.lock.answered(call.shard, call.request, answer, self.local_ns)
             else:
                 self.client.answered(call.shard, call.request, answer, self.local_ns)
-            self._model.of_clients.check_beliefs(self)
+            self._check_beliefs(self)
 
     # ---------------------------------------------------------------- the session
 
@@ -262,7 +261,7 @@ class ClientHost(Host):
                 if answer is not None:
                     self.learn(shard, answer)
                 lock.answered(shard, request, answer, self.local_ns)
-            self._model.of_clients.check_beliefs(self)
+            self._check_beliefs(self)
         for shard, farewell in lock.take_farewells():
             self.call(shard, farewell, lambda _answer: None)
 

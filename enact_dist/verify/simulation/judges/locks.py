@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 from enact_dist.core.protocol.datum import LockId, Token
 from enact_dist.core.protocol.messages import Acquire, KeepAlive
 from enact_dist.core.protocol.records import Tick
-from enact_dist.verify.simulation.history import conflict
+from enact_dist.verify.simulation.judges.history import conflict
 
 if TYPE_CHECKING:
     from enact_dist.core.state.grants import Tenure
-    from enact_dist.verify.simulation.picture import Picture
-    from enact_dist.verify.simulation.shard_host import ShardHost
-    from enact_dist.verify.simulation.world import World
+    from enact_dist.verify.simulation.hosts.shard_host import ShardHost
+    from enact_dist.verify.simulation.hosts.world import World
+    from enact_dist.verify.simulation.judges.picture import Picture
 
 
 class LockJudge:

@@ -8,16 +8,16 @@ from enact_dist.core.client.plan import Phase
 from enact_dist.core.protocol.messages import Forgotten
 from enact_dist.terms import Access, Durability
 from enact_dist.verify.simulation.cells import CONTEXTS
-from enact_dist.verify.simulation.history import TOLD_NOT, Entry, History, conflict
+from enact_dist.verify.simulation.judges.history import TOLD_NOT, Entry, conflict
 
 if TYPE_CHECKING:
     from enact_dist.core.client.lock import MultiLock
     from enact_dist.core.client.plan import Reading
     from enact_dist.core.protocol.datum import Datum, Slot
     from enact_dist.core.protocol.messages import Surveyed
-    from enact_dist.verify.simulation.client_host import ClientHost
-    from enact_dist.verify.simulation.model import Model
-    from enact_dist.verify.simulation.world import World
+    from enact_dist.verify.simulation.hosts.client_host import ClientHost
+    from enact_dist.verify.simulation.judges.growth import GrowthJudge
+    from enact_dist.verify.simulation.judges.history import Observations
 
     Own = dict[Slot, tuple[str, int, int]]
 
@@ -25,9 +25,10 @@ if TYPE_CHECKING:
 class ClientJudge:
     """Checks what clients believe, read and learn."""
 
-    def __init__(self, world: World, history: History, model: Model) -> None:
-        self._world, self._history, self._model = world, history, model
-        self._fail = world.violation
+    def __init__(self, observed: Observations, growth: GrowthJudge) -> None:
+        self._observed, self._growth = observed, growth
+        self._world, self._history = observed.world, observed.history
+        self._fail = observed.fail
         self.clients: list[ClientHost] = []
 
     def holds(self, host: ClientHost, entry: Entry) -> None:
@@ -53,7 +54,7 @@ class ClientJudge:
 
     def datum_seen(self, reading: Reading, datum: Datum | None) -> None:
         """A thread looks at a datum, from the grant, its cache or a fetch: is it the right one?"""
-        picture = self._model.pictures[reading.shard]
+        picture = self._observed.pictures[reading.shard]
         state = reading.state
         for one in reversed(picture.chains.get(state.slot, ())):
             if one.epoch <= reading.epoch and one.name == (state.version, state.stamp_ns):
@@ -77,7 +78,7 @@ class ClientJudge:
         """
         newest = {state.slot: state for state in answer.states}
         for slot, (at_shard, epoch, stamp_ns) in own.items():
-            durable = self._model.durabilities[slot.aspect] is Durability.DURABLE
+            durable = self._observed.durabilities[slot.aspect] is Durability.DURABLE
             state = newest.get(slot)
             if at_shard == shard and state is not None and (durable or epoch == answer.epoch):
                 self._world.tally["own commits found in surveys"] += 1
@@ -89,7 +90,7 @@ class ClientJudge:
         stamps = entry.stamps()
         for shard, epoch, state in entry.lock.states:
             at_shard, at_epoch, stamp_ns = own.get(state.slot, ("", 0, 0))
-            durable = self._model.durabilities[state.slot.aspect] is Durability.DURABLE
+            durable = self._observed.durabilities[state.slot.aspect] is Durability.DURABLE
             if at_shard == shard and (durable or epoch == at_epoch) and state.slot not in stamps:
                 self._world.tally["own commits seen"] += 1
                 if state.stamp_ns < stamp_ns:
@@ -98,13 +99,13 @@ class ClientJudge:
     def told(self, host: ClientHost, entry: Entry) -> None:
         """Check the outcome of a lock that its thread has learned."""
         self._world.tally[f"told: {entry.told.value if entry.told else '-'}"] += 1
-        applied = any(entry.id in picture.applied for picture in self._model.pictures.values())
+        applied = any(entry.id in picture.applied for picture in self._observed.pictures.values())
         refusal = entry.lock.refusal
-        skewed = self._model.clocks_were_set and getattr(refusal, "code", "") == "clock_skew"
-        explained = skewed or isinstance(refusal, Forgotten) or self._model.growth.explains(entry)
+        skewed = self._observed.clocks_were_set and getattr(refusal, "code", "") == "clock_skew"
+        explained = skewed or isinstance(refusal, Forgotten) or self._growth.explains(entry)
         if refusal is not None and not explained:
             self._fail("nothing is refused", entry.id, refusal)
-        applied = applied or entry.id in self._model.permitted_losses
+        applied = applied or entry.id in self._observed.permitted_losses
         if entry.told is Phase.COMMITTED and entry.lock.versions and not applied:
             self._fail("I5 told committed, not visible", entry.id)
         if entry.told in TOLD_NOT and applied and not self._may_be_gone(entry):
@@ -123,7 +124,7 @@ class ClientJudge:
     def _check_confirmed(self, entry: Entry) -> None:
         """P3: each part was asked, at its end, whether it had been held all the time."""
         for part in entry.lock.parts:
-            picture = self._model.pictures[part.shard]
+            picture = self._observed.pictures[part.shard]
             if part.token != picture.confirmed.get(entry.id):
                 self._fail("P3 every lock is confirmed", entry.id, part.shard, part.token)
 
@@ -131,9 +132,9 @@ class ClientJudge:
         """Whether a restart may have undone the lock's writes: volatile, or `os` and power cut."""
         written = (item for item in entry.items if Access(item.access).writes)
         volatile = all(
-            self._model.durabilities[item.aspect] is Durability.VOLATILE for item in written
+            self._observed.durabilities[item.aspect] is Durability.VOLATILE for item in written
         )
-        return volatile or entry.id in self._model.permitted_losses
+        return volatile or entry.id in self._observed.permitted_losses
 
 
 def _believed(host: ClientHost) -> list[MultiLock]:

@@ -18,9 +18,9 @@ from enact_dist.core.protocol.messages import AspectEntry, Refused, Register, Re
 from enact_dist.core.protocol.placement import shard_of
 from enact_dist.core.shard.on_lock import NEWER_TYPE
 from enact_dist.terms import Access
-from enact_dist.verify.simulation.client_host import Calls, ClientHost, Sleep, Steps
-from enact_dist.verify.simulation.growth_judge import NEWER, NEWER_ENCODING, OLDER
-from enact_dist.verify.simulation.world import MS, S
+from enact_dist.verify.simulation.hosts.client_host import Calls, ClientHost, Sleep, Steps
+from enact_dist.verify.simulation.hosts.world import MS, S
+from enact_dist.verify.simulation.judges.growth import NEWER, NEWER_ENCODING, OLDER
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from enact_dist.core.client.lock import MultiLock
     from enact_dist.core.protocol.datum import Datum, Slot
     from enact_dist.core.protocol.messages import Item
-    from enact_dist.verify.simulation.model import Model
-    from enact_dist.verify.simulation.world import World
+    from enact_dist.verify.simulation.hosts.world import World
+    from enact_dist.verify.simulation.judges.model import Model
 
 SHARE: Final = 0.4
 """Share of the runs in which a type grows."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Protocol, cast
 
 from enact_dist.core.protocol.messages import Answer, Finish, Refused, Request, Stage
 from enact_dist.core.protocol.records import (
@@ -16,24 +16,39 @@ from enact_dist.core.protocol.records import (
     Tick,
 )
 from enact_dist.core.shard.shard import Shard
-from enact_dist.verify.simulation.disk import Disk
-from enact_dist.verify.simulation.payloads import ShardPayloads, as_kept
-from enact_dist.verify.simulation.world import MS, Host, S
+from enact_dist.verify.simulation.hosts.disk import Disk
+from enact_dist.verify.simulation.hosts.payloads import ShardPayloads, as_kept
+from enact_dist.verify.simulation.hosts.world import MS, Host, S
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
     from random import Random
 
-    from enact_dist.core.protocol.records import Event
+    from enact_dist.core.protocol.records import Effect, Event, Recovered
     from enact_dist.core.shard.state import ShardSettings
     from enact_dist.verify.simulation.faults import Faults
-    from enact_dist.verify.simulation.model import Model
-    from enact_dist.verify.simulation.network import Network
-    from enact_dist.verify.simulation.world import World
+    from enact_dist.verify.simulation.hosts.network import Network
+    from enact_dist.verify.simulation.hosts.world import World
 
 
 ASSERT_EVERY = 4
 """Steps between two looks at the shard's own assertions; the judge looks at each step."""
+
+
+class ShardJudge(Protocol):
+    """Looks at each step of a shard, and at its crashes and starts."""
+
+    def booted(self, host: ShardHost, recovered: Recovered, *, crashed_at_ns: int) -> None:
+        """A shard has started with what its disk kept."""
+
+    def judge_prefixes(self, host: ShardHost, *, power_cut: bool) -> None:
+        """A shard is about to lose what a crash may take."""
+
+    def crashed(self, host: ShardHost, lost: list[Persist], *, power_cut: bool) -> None:
+        """A shard has died, and its disk has lost these records."""
+
+    def handled(self, host: ShardHost, message: object, effects: Sequence[Effect]) -> None:
+        """A shard has taken a message and decided."""
 
 
 class ShardHost(Host):
@@ -49,7 +64,7 @@ class ShardHost(Host):
         self.faults = faults
         self.disk = Disk(world, faults, settings.name)
         self.asserts = True
-        self.model: Model
+        self.judge: ShardJudge
         self.shard: Shard
         self.payloads: ShardPayloads
         self.tokens: Callable[[ShardHost], list[str]] = lambda _host: []
@@ -75,8 +90,8 @@ class ShardHost(Host):
         self._replies.clear()
         self.asked.clear()
         self.shard = Shard(self.settings, recovered, now_ns=self.local_ns, wall_ns=self.wall_ns)
-        self.payloads = ShardPayloads(self)
-        self.model.booted(self, recovered, crashed_at_ns=self._crashed_at_ns)
+        self.payloads = ShardPayloads(self, self.shard)
+        self.judge.booted(self, recovered, crashed_at_ns=self._crashed_at_ns)
         self._tick_due_ns = 0
         self._plan_tick()
         for session in self.tokens(self):
@@ -95,9 +110,9 @@ class ShardHost(Host):
         self._inbox.clear()
         self._crashed_at_ns = self.world.now_ns
         self._tally_counters()
-        self.model.judge_prefixes(self, power_cut=power_cut)
+        self.judge.judge_prefixes(self, power_cut=power_cut)
         lost = self.disk.crash(power_cut=power_cut, luck=luck)
-        self.model.crashed(self, lost, power_cut=power_cut)
+        self.judge.crashed(self, lost, power_cut=power_cut)
         self.world.after(down_ns, self.boot)
 
     def _tally_counters(self) -> None:
@@ -161,7 +176,7 @@ class ShardHost(Host):
         self._steps += 1
         if self.asserts and self._steps % ASSERT_EVERY == 0:
             self.shard.assert_invariants()
-        self.model.handled(self, message, effects)
+        self.judge.handled(self, message, effects)
         for effect in effects:
             if isinstance(effect, Reply):
                 reply = self._replies.pop(effect.reply_to, None)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from enact_dist.core.offline.ledger import Ledger
 from enact_dist.terms import Durability
-from enact_dist.verify.simulation.world import MS
+from enact_dist.verify.simulation.hosts.world import MS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from enact_dist.core.protocol.records import Persist, Recovered
     from enact_dist.verify.simulation.faults import Faults
-    from enact_dist.verify.simulation.world import Host, World
+    from enact_dist.verify.simulation.hosts.world import Host, World
 
 
 class Disk:

@@ -8,13 +8,16 @@ from typing import TYPE_CHECKING
 from enact_dist.core.client.plan import Phase
 from enact_dist.core.protocol.datum import Slot
 from enact_dist.patterns import pattern_matches, patterns_overlap
-from enact_dist.terms import Access
+from enact_dist.terms import Access, Durability
 
 if TYPE_CHECKING:
     from enact_dist.core.client.lock import MultiLock
     from enact_dist.core.client.plan import Reading
     from enact_dist.core.protocol.datum import LockId
     from enact_dist.core.protocol.messages import Item
+    from enact_dist.core.protocol.records import DecisionRecord
+    from enact_dist.verify.simulation.hosts.world import World
+    from enact_dist.verify.simulation.judges.picture import Picture
 
 TOLD_NOT = frozenset(
     (
@@ -103,6 +106,45 @@ class History:
         """Note how it ended."""
         entry.ended_ns = now_ns
         entry.told = entry.lock.phase
+
+
+class Observations:
+    """What is known of a run: the locks of its clients, and a picture of each shard.
+
+    Attributes:
+        absent: Slots that a lock found without a state, by shard, with that shard's epoch.
+        permitted_losses: Commits that a power cut undid as their durability permits.
+        decided: Commits over several shards whose decision is on disk.
+        clocks_were_set: Whether commits may be refused for a wall clock.
+    """
+
+    def __init__(self, world: World, history: History, durabilities: dict[str, Durability]) -> None:
+        self.world, self.history, self.durabilities = world, history, durabilities
+        self.pictures: dict[str, Picture] = {}
+        self.absent: dict[LockId, dict[tuple[str, Slot], tuple[int, tuple[int, int]]]] = {}
+        self.permitted_losses: dict[LockId, None] = {}
+        self.decided: dict[LockId, DecisionRecord] = {}
+        self.clocks_were_set = False
+
+    def fail(self, rule: str, *facts: object) -> None:
+        """Stop the run: a rule is broken."""
+        self.world.violation(rule, *facts)
+
+    def count(self, name: str, number: int) -> None:
+        """Add to a tally of the run."""
+        self.world.tally[name] += number
+
+    def entry(self, lock: LockId) -> Entry | None:
+        """Return what a client knows of its lock."""
+        return self.history.entries.get(lock)
+
+    def is_volatile(self, slot: Slot) -> bool:
+        """Whether a restart loses the data of a slot."""
+        return self.durabilities[slot.aspect] is Durability.VOLATILE
+
+    def clock_was_set(self) -> None:
+        """A wall clock was set: commits may be refused for it from now on."""
+        self.clocks_were_set = True
 
 
 def _covers(item: Item, reading: Reading) -> bool:

@@ -20,25 +20,25 @@ from enact_dist.core.protocol.messages import (
 from enact_dist.patterns import pattern_matches
 from enact_dist.terms import Access, NullReason
 from enact_dist.verify.simulation.cells import CONTEXTS
-from enact_dist.verify.simulation.picture import NEVER_SET, State
-from enact_dist.verify.simulation.reader_judge import stamp_of
+from enact_dist.verify.simulation.judges.picture import NEVER_SET, State
+from enact_dist.verify.simulation.judges.readers import stamp_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from enact_dist.core.protocol.messages import Forgotten, Item, SlotState, VersionEntry, Versions
     from enact_dist.core.protocol.records import Recovered
-    from enact_dist.verify.simulation.model import Model
-    from enact_dist.verify.simulation.picture import Picture
-    from enact_dist.verify.simulation.shard_host import ShardHost
+    from enact_dist.verify.simulation.hosts.shard_host import ShardHost
+    from enact_dist.verify.simulation.judges.history import Observations
+    from enact_dist.verify.simulation.judges.picture import Picture
 
 
 class PastJudge:
     """Looks at strict views, at lists of versions and at what labels keep."""
 
-    def __init__(self, model: Model, retentions: dict[str, int]) -> None:
-        self._model = model
-        self._fail = model.fail
+    def __init__(self, observed: Observations, retentions: dict[str, int]) -> None:
+        self._observed = observed
+        self._fail = observed.fail
         self._retentions = retentions
 
     # ---------------------------------------------------------------- as of a stamp
@@ -48,7 +48,7 @@ class PastJudge:
     ) -> None:
         """A strict view shows every slot as it was then, those that were deleted since, too."""
         if answer.until_ns < at_ns:
-            self._model.count("strict views to be asked again", 1)
+            self._observed.count("strict views to be asked again", 1)
             return
         if answer.from_ns > at_ns:
             self._fail("a view of the past is of its moment", answer, at_ns)
@@ -60,7 +60,7 @@ class PastJudge:
                 self._fail("a view of the past shows all that was", slot, at_ns, right)
             if state is not None:
                 self._check_state(state, right, at_ns, picture)
-            self._model.count("data shown as of long ago", right.name != picture.now(slot).name)
+            self._observed.count("data shown as of long ago", right.name != picture.now(slot).name)
 
     def _check_state(self, state: SlotState, right: State, at_ns: int, picture: Picture) -> None:
         found = state.version, state.stamp_ns, state.captured_ns
@@ -76,7 +76,7 @@ class PastJudge:
             return ("",)
         if right.version:
             return (NullReason.DELETED.name,)
-        if self._model.is_volatile(slot) and picture.epoch > 1:
+        if self._observed.is_volatile(slot) and picture.epoch > 1:
             # A restart may know that a slot exists whose only write came to nothing; a power cut
             # may take the record of a slot that was written.
             unknown = right is NEVER_SET or slot in picture.vanished
@@ -93,12 +93,12 @@ class PastJudge:
         if answer.slot not in slots and any(_names(item, answer.slot) for item in asked.items):
             slots.append(answer.slot)
         latest_ns = max((self._since_ns(slot, picture) for slot in slots), default=0)
-        leapt = self._model.clocks_were_set  # what is retained may have grown old in one leap
+        leapt = self._observed.clocks_were_set  # what is retained may have grown old in one leap
         if not leapt and all(self._must_know(slot, asked.at_ns, picture) for slot in slots):
             self._fail("what is retained is not forgotten", answer, asked, latest_ns)
         if not (asked.at_ns < answer.oldest_ns and (leapt or answer.oldest_ns <= latest_ns)):
             self._fail("it is said since when all is known", answer, asked, latest_ns)
-        self._model.count("views of what is forgotten", 1)
+        self._observed.count("views of what is forgotten", 1)
 
     def _must_know(self, slot: Slot, at_ns: int, picture: Picture) -> bool:
         kept = picture.labels_of(slot)
@@ -106,7 +106,7 @@ class PastJudge:
 
     def _since_ns(self, slot: Slot, picture: Picture) -> int:
         """Return the stamp from which on a slot must be known."""
-        volatile = self._model.is_volatile(slot)
+        volatile = self._observed.is_volatile(slot)
         line = picture.line(slot, volatile=volatile)
         held = line[-self._retentions[slot.aspect] :]
         if held and held[0].version > 1:
@@ -137,7 +137,7 @@ class PastJudge:
                 self._check_entries(slot, told.get(slot, []), picture)
 
     def _check_entries(self, slot: Slot, found: list[VersionEntry], picture: Picture) -> None:
-        line = picture.line(slot, volatile=self._model.is_volatile(slot))
+        line = picture.line(slot, volatile=self._observed.is_volatile(slot))
         held = line[-self._retentions[slot.aspect] :]
         kept = {state.version: state for state in picture.labels_of(slot)}
         names = [(e.state.version, e.state.stamp_ns) for e in found if e.state.version]
@@ -153,7 +153,7 @@ class PastJudge:
             until_ns = 0 if after is None else after.state.stamp_ns
             if entry.until_ns != until_ns and not (last and after is not None):
                 self._fail("a list says until when each was current", entry, until_ns)
-        self._model.count("replaced versions listed", max(0, len(names) - 1))
+        self._observed.count("replaced versions listed", max(0, len(names) - 1))
 
     # ---------------------------------------------------------------- labels
 
@@ -174,10 +174,10 @@ class PastJudge:
         if now:
             picture.labels[message.label] = {key: self._state(key, picture) for key in now}
         picture.confirmed_labels.pop(message.label, None)
-        self._model.count("labels changed", 1)
+        self._observed.count("labels changed", 1)
 
     def _state(self, key: SlotVersion, picture: Picture) -> State:
-        line = picture.line(key.slot, volatile=self._model.is_volatile(key.slot))
+        line = picture.line(key.slot, volatile=self._observed.is_volatile(key.slot))
         for state in (*reversed(line), *picture.labels_of(key.slot)):
             if state.version == key.version:
                 return state
@@ -202,10 +202,10 @@ class PastJudge:
         picture.promised.clear()
         found = {label: set(kept) for label, kept in slots.history.labels.items()}
         for label in picture.confirmed_labels:
-            stored = {k for k in picture.labels[label] if not self._model.is_volatile(k.slot)}
+            stored = {k for k in picture.labels[label] if not self._observed.is_volatile(k.slot)}
             if not stored <= found.get(label, set()):
                 self._fail("what is kept survives", label, stored, found.get(label))
-            self._model.count("kept versions found after a restart", len(stored))
+            self._observed.count("kept versions found after a restart", len(stored))
         for label in [label for label in picture.confirmed_labels if label not in found]:
             del picture.confirmed_labels[label]
         picture.labels = {
