@@ -1,4 +1,4 @@
-"""A process of the pipeline: `python -m enact_dist.bench.pipeline_worker CELL ROLE OPTIONS`.
+"""A process of the pipeline: `python -m enact_dist.bench.cases.pipeline_worker CELL ROLE OPTIONS`.
 
 =========  ======================================================================================
 camera     stores an image at each tick, with the tick as its capture stamp

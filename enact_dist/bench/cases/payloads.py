@@ -20,11 +20,11 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from enact_dist.access.lock import Lock
+from enact_dist.bench.cases.updates import floor_of
 from enact_dist.bench.floors import SIZES, mapped, reply, written
 from enact_dist.bench.place import EMBEDDED
 from enact_dist.bench.rows import Case, Key, at_most, times
 from enact_dist.bench.timing import timed
-from enact_dist.bench.updates import floor_of
 from enact_dist.terms import Aspect, Durability, Entity, Read, Write
 
 if TYPE_CHECKING:

@@ -12,14 +12,15 @@ the bench's own, less that of the same 17 doing the same work on arrays of their
 
 from __future__ import annotations
 
+import collections
 import json
 import math
 import time
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+from enact_dist.bench.cases.pipeline_worker import CAMERAS, PERIOD_NS
 from enact_dist.bench.floors import written
-from enact_dist.bench.pipeline_ticks import STAGES, Ticks, ticks_of
-from enact_dist.bench.pipeline_worker import CAMERAS, PERIOD_NS
 from enact_dist.bench.place import PIPELINE_WORKER
 from enact_dist.bench.rows import Case, Row, at_most, value_row
 from enact_dist.bench.timing import sleep_until
@@ -27,7 +28,7 @@ from enact_dist.bench.usage import Usage
 from enact_dist.link.memory.shared_folder import shared_root
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from enact_dist.bench.run import Run
     from enact_dist.bench.usage import Sampled
@@ -44,6 +45,10 @@ GROWTH_MAX: Final = 50_000.0
 """Bytes per second that noise may look like; one image that stays per second is 18 times that."""
 KINDS: Final = {"camera": "cameras", "segmenter": "workers", "consumer": "reader"}
 SHARD: Final = "shards"
+STAGES: Final = ("camera's wake-up", "image's commit", "worker", "reader")
+"""Where a tick's time goes, in this order; each ends with the slowest of the eight."""
+IN_TIME_NS: Final = 100_000_000
+"""A set that is read later than one period after its tick counts as missed."""
 
 
 def run_pipeline(run: Run) -> None:
@@ -201,3 +206,90 @@ class _Measured:
             start_ns=self._start_ns,
             period_ns=PERIOD_NS,
         )
+
+
+# ---------------------------------------------------------------- what became of each tick
+
+
+@dataclass(frozen=True, slots=True)
+class Ticks:
+    """The ticks of one run.
+
+    Attributes:
+        latencies_us: Of the sets that were read: from the earliest image's store to the set.
+        stages_us: The time of each stage, of the sets that were read.
+        reasons: How many ticks were missed, by reason.
+        torn: Sets whose masks were not of one frame.
+    """
+
+    latencies_us: list[float]
+    stages_us: dict[str, list[float]]
+    reasons: dict[str, int]
+    torn: int
+
+    @property
+    def missed(self) -> int:
+        """How many ticks were missed."""
+        return sum(self.reasons.values())
+
+
+def ticks_of(
+    cameras: Sequence[Mapping[str, Any]],
+    segmenters: Sequence[Mapping[str, Any]],
+    consumer: Mapping[str, Any],
+    *,
+    ticks: range,
+    start_ns: int,
+    period_ns: int,
+) -> Ticks:
+    """Join what all processes say about the ticks that count.
+
+    Args:
+        cameras: "ticks": (tick, begin of the store, its end) of each image.
+        segmenters: "ticks": (tick, when its mask was made).
+        consumer: "sets": (tick, when it was read, latency); "torn": ticks of torn sets.
+        ticks: The ticks that count.
+        start_ns: When tick 0 was due.
+        period_ns: Between two ticks.
+    """
+    stored = [{tick: (begun, ended) for tick, begun, ended in one["ticks"]} for one in cameras]
+    made = [dict(one["ticks"]) for one in segmenters]
+    read = {tick: (had, latency) for tick, had, latency in consumer["sets"]}
+    torn = set(consumer["torn"]) & set(ticks)
+    found = Ticks([], {stage: [] for stage in STAGES}, {}, len(torn))
+    reasons: collections.Counter[str] = collections.Counter()
+    for tick in ticks:
+        if tick in torn:
+            reasons["masks of different frames"] += 1
+        elif any(tick not in one for one in stored):
+            reasons["no image was stored"] += 1
+        elif any(tick not in one for one in made):
+            reasons["a worker passed over its image"] += 1
+        elif tick not in read:
+            reasons["the reader passed over its set"] += 1
+        else:
+            had_ns, latency_ns = read[tick]
+            due_ns = start_ns + tick * period_ns
+            ends_ns = (
+                max(one[tick][0] for one in stored),
+                max(one[tick][1] for one in stored),
+                max(one[tick] for one in made),
+                had_ns,
+            )
+            times_us = _between_us(due_ns, ends_ns)
+            for stage, time_us in zip(STAGES, times_us, strict=True):
+                found.stages_us[stage].append(time_us)
+            found.latencies_us.append(latency_ns / 1e3)
+            if had_ns - due_ns > IN_TIME_NS:
+                slowest = STAGES[times_us.index(max(times_us))]
+                reasons[f"late, mostly by the {slowest}"] += 1
+    found.reasons.update(reasons)
+    return found
+
+
+def _between_us(begin_ns: int, ends_ns: Sequence[int]) -> list[float]:
+    times_us = []
+    for end_ns in ends_ns:
+        times_us.append(max(0, end_ns - begin_ns) / 1e3)
+        begin_ns = max(begin_ns, end_ns)
+    return times_us

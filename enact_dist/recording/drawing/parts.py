@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from enact_dist.recording.geometry import is_rigid
+from enact_dist.recording.drawing.geometry import is_rigid
 
 NUMBER_MAX: Final = 1e15
 """Larger sizes and focal lengths are invalid."""

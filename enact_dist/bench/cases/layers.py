@@ -21,14 +21,23 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.access import reads as reading
-from enact_dist.bench import payloads
+from enact_dist.bench.cases import payloads
+from enact_dist.bench.cases.payloads import (
+    ARRAY,
+    LARGEST,
+    SMALL,
+    WAIT_S,
+    Storer,
+    entity,
+    fetch,
+    floats,
+)
+from enact_dist.bench.cases.updates import floor_of, slots, update
 from enact_dist.bench.floors import PAUSED, SIZES, mapped, reply
-from enact_dist.bench.payloads import ARRAY, LARGEST, SMALL, WAIT_S, Storer, entity, fetch, floats
 from enact_dist.bench.place import EMBEDDED
 from enact_dist.bench.rows import Case
 from enact_dist.bench.run import ROUNDS
 from enact_dist.bench.timing import COUNT_MAX, PAUSE_S, timed
-from enact_dist.bench.updates import floor_of, slots, update
 from enact_dist.core.shard.shard import Shard
 from enact_dist.errors import LinkError
 from enact_dist.link.client.locks import CellClient

@@ -1,4 +1,4 @@
-"""A bare Python echo over a Unix socket, as a floor: `python -m …bench.raw_socket PATH`."""
+"""A bare Python echo over a Unix socket, as a floor: `python -m …echoes.socket_echo PATH`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Final
 SMALL_BYTES: Final = 64
 
 
-class RawSocket:
+class SocketEcho:
     """The near end.  A context manager."""
 
     def __init__(self, path: Path) -> None:
@@ -31,7 +31,7 @@ class RawSocket:
         """Hang up; the echo ends with that."""
         self._socket.close()
 
-    def __enter__(self) -> RawSocket:
+    def __enter__(self) -> SocketEcho:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -1,4 +1,4 @@
-"""Raw Zenoh between two processes, as a floor: `python -m enact_dist.bench.raw_zenoh PORT` serves.
+"""Raw Zenoh between two processes, as a floor: `python -m …echoes.zenoh_echo PORT` serves.
 
 A query is answered with as many bytes as its payload asks for; a publication is sent back.
 """
@@ -38,7 +38,7 @@ def _config(port: int, *, listen: bool) -> Any:
     )
 
 
-class RawZenoh:
+class ZenohEcho:
     """The near end.  A context manager."""
 
     def __init__(self, port: int) -> None:
@@ -85,7 +85,7 @@ class RawZenoh:
         """Close the session."""
         self._session.close()
 
-    def __enter__(self) -> RawZenoh:
+    def __enter__(self) -> ZenohEcho:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from enact_dist.access.lock import Lock
+from enact_dist.bench.cases.updates import WAIT_S, floor_of, update
 from enact_dist.bench.place import EMBEDDED, WORLD, Place, environment, fresh_place
 from enact_dist.bench.rows import Case, Goal, Key, times, value_row
 from enact_dist.bench.timing import timed
-from enact_dist.bench.updates import WAIT_S, floor_of, update
 from enact_dist.bench.usage import Usage
 from enact_dist.errors import UnknownWorldError
 from enact_dist.retention import Retention

@@ -23,7 +23,7 @@ from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletio
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from foxglove_schemas_protobuf.TriangleListPrimitive_pb2 import TriangleListPrimitive
 
-from enact_dist.recording.geometry import (
+from enact_dist.recording.drawing.geometry import (
     encoded_indices,
     encoded_points,
     image_bytes,
@@ -31,7 +31,7 @@ from enact_dist.recording.geometry import (
     packed_points,
     quaternion,
 )
-from enact_dist.recording.parts import (
+from enact_dist.recording.drawing.parts import (
     array_beside,
     arrays_of,
     guess,
@@ -41,7 +41,7 @@ from enact_dist.recording.parts import (
     part_at,
     parts_of,
 )
-from enact_dist.recording.solids import capsule_of, voxel_faces
+from enact_dist.recording.drawing.solids import capsule_of, voxel_faces
 from enact_dist.wire.payload import decode_untyped
 
 if TYPE_CHECKING:

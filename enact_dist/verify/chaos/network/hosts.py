@@ -23,8 +23,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
 from enact_dist.errors import LinkError
-from enact_dist.verify.chaos import switch
-from enact_dist.verify.chaos.switch import Cable, Counts
+from enact_dist.verify.chaos.network import switch
+from enact_dist.verify.chaos.network.switch import Cable, Counts
 from enact_dist.verify.daemons import KeptPorts, LineProcess
 
 if TYPE_CHECKING:

@@ -1,6 +1,6 @@
 """An Ethernet switch in user space: what lies between two hosts is slow, lossy, narrow or cut.
 
-``python -m enact_dist.verify.chaos.switch SEED PORTS`` forwards between the interfaces `v0`, `v1`
+``python -m …chaos.network.switch SEED PORTS`` forwards between the interfaces `v0`, `v1`
 and so on of its network namespace, whose other ends have the addresses of `address`; it says
 `started`, then takes one change per line (a JSON array) and says `done` once it holds:
 
@@ -37,7 +37,7 @@ from enact_dist.errors import MisuseError
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-MODULE: Final = "enact_dist.verify.chaos.switch"
+MODULE: Final = "enact_dist.verify.chaos.network.switch"
 QUEUE_S: Final = 0.25
 """What a narrow cable cannot carry within so long is dropped, as by a router."""
 _ALL_PROTOCOLS: Final = 0x0003

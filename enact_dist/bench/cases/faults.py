@@ -11,10 +11,10 @@ import statistics
 import time
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.bench.payloads import WAIT_S, entity, store
+from enact_dist.bench.cases.payloads import WAIT_S, entity, store
+from enact_dist.bench.cases.updates import slots, update
 from enact_dist.bench.rows import Row, sample_of
 from enact_dist.bench.timing import timed
-from enact_dist.bench.updates import slots, update
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""A process beside the one that measures: `python -m enact_dist.bench.worker CELL ROLE OPTIONS`.
+"""A process beside the measuring one: `python -m enact_dist.bench.cases.worker CELL ROLE OPTIONS`.
 
 ========  =======================================================================================
 storer    writes an array anew at each line ``ENTITY BYTES``
@@ -22,11 +22,11 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from enact_dist.access.lock import Lock
-from enact_dist.bench.history import CAMERAS, IMAGE_BYTES, IMAGES, PERIOD_NS, side_of
-from enact_dist.bench.payloads import ARRAY, WAIT_S, said, store
+from enact_dist.bench.cases.history import CAMERAS, IMAGE_BYTES, IMAGES, PERIOD_NS, side_of
+from enact_dist.bench.cases.payloads import ARRAY, WAIT_S, said, store
+from enact_dist.bench.cases.updates import slots
 from enact_dist.bench.place import WORLD
 from enact_dist.bench.timing import sleep_until
-from enact_dist.bench.updates import slots
 from enact_dist.link.client.fetch import DatumCache
 from enact_dist.terms import Entity, View, Write
 from enact_dist.world.connecting import connect
