@@ -13,22 +13,22 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.bench.decisions import core_cases
-from enact_dist.bench.faults import run_recovery, run_stopped
+from enact_dist.bench.cases.decisions import core_cases
+from enact_dist.bench.cases.faults import run_recovery, run_stopped
+from enact_dist.bench.cases.history import run_history
+from enact_dist.bench.cases.layers import run_layers
+from enact_dist.bench.cases.memory import run_memory
+from enact_dist.bench.cases.palletizing import run_palletizing
+from enact_dist.bench.cases.payloads import run_fetch, run_publish, run_wakeup
+from enact_dist.bench.cases.pipeline import run_pipeline
+from enact_dist.bench.cases.updates import run_durable, run_multi, run_update, run_waiters
+from enact_dist.bench.cases.workcell import run_workcell
 from enact_dist.bench.floors import Floors
-from enact_dist.bench.history import run_history
-from enact_dist.bench.layers import run_layers
-from enact_dist.bench.memory import run_memory
-from enact_dist.bench.palletizing import run_palletizing
-from enact_dist.bench.payloads import run_fetch, run_publish, run_wakeup
-from enact_dist.bench.pipeline import run_pipeline
 from enact_dist.bench.place import EMBEDDED, Place
 from enact_dist.bench.rows import Row, shown_spread, shown_us
 from enact_dist.bench.run import Answer, Asked, Run
 from enact_dist.bench.tables import table
-from enact_dist.bench.updates import run_durable, run_multi, run_update, run_waiters
 from enact_dist.bench.visit import PEAK_BYTES, without_room
-from enact_dist.bench.workcell import run_workcell
 from enact_dist.cli.text.benches import BENCHES as TOLD
 from enact_dist.cli.text.output import print_json, print_table
 from enact_dist.cli.verbs import DONE, FAILED

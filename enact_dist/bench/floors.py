@@ -23,7 +23,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.bench.raw_socket import RawSocket
+from enact_dist.bench.echoes.socket_echo import SocketEcho
 from enact_dist.bench.rows import FLOOR, Case
 from enact_dist.bench.timing import PAUSE_S, timed
 from enact_dist.errors import MisuseError
@@ -32,7 +32,7 @@ from enact_dist.verify.daemons import KeptPorts, LineProcess
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from enact_dist.bench.raw_zenoh import RawZenoh
+    from enact_dist.bench.echoes.zenoh_echo import ZenohEcho
     from enact_dist.bench.rows import Key
 
 PAUSED: Final = ", paused"
@@ -140,20 +140,20 @@ class Floors:
         process.expect("ready:")
 
     @functools.cached_property
-    def _zenoh(self) -> RawZenoh:
-        from enact_dist.bench.raw_zenoh import RawZenoh
+    def _zenoh(self) -> ZenohEcho:
+        from enact_dist.bench.echoes.zenoh_echo import ZenohEcho
 
         ports = KeptPorts()
         self._stack.callback(ports.close)
         port = ports.free()
-        self._process("enact_dist.bench.raw_zenoh", str(port))
-        return self._stack.enter_context(RawZenoh(port))
+        self._process("enact_dist.bench.echoes.zenoh_echo", str(port))
+        return self._stack.enter_context(ZenohEcho(port))
 
     @functools.cached_property
-    def _socket(self) -> RawSocket:
+    def _socket(self) -> SocketEcho:
         path = self._memory / "echo"
-        self._process("enact_dist.bench.raw_socket", str(path))
-        return self._stack.enter_context(RawSocket(path))
+        self._process("enact_dist.bench.echoes.socket_echo", str(path))
+        return self._stack.enter_context(SocketEcho(path))
 
     # ---------------------------------------------------------------- memory and disk
 

@@ -28,8 +28,8 @@ WORLD: Final = "bench"
 EMBEDDED: Final = "embedded"
 CARRIER_VARIABLE: Final = "ENACT_CARRIER"
 COMMAND: Final = "enact_dist.cli.main"
-WORKER: Final = "enact_dist.bench.worker"
-PIPELINE_WORKER: Final = "enact_dist.bench.pipeline_worker"
+WORKER: Final = "enact_dist.bench.cases.worker"
+PIPELINE_WORKER: Final = "enact_dist.bench.cases.pipeline_worker"
 WORKERS_S: Final = 120.0
 """Many processes that start at once on few processors take this long at most."""
 END_S: Final = 5.0
@@ -256,7 +256,7 @@ class Place:
 
     @contextlib.contextmanager
     def worker(self, role: str, *, carrier: str, **options: Any) -> Iterator[LineProcess]:
-        """Run `enact_dist.bench.worker` in a role; it has said ``ready:``."""
+        """Run `enact_dist.bench.cases.worker` in a role; it has said ``ready:``."""
         with self.workers([(role, options)], carrier=carrier) as (process,):
             yield process
 

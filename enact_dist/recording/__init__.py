@@ -8,7 +8,7 @@ topic                           encoding                 one message is
 ==============================  =======================  =========================================
 ``/enact/<world>/<aspect>``     msgpack                  one version, exact: see `exact`
 ``/enact/gaps``                 json                     versions that the recording does not have
-``/<world>/<entity>/<aspect>``  protobuf or json         the same version to look at: see `pictures`
+``/<world>/<entity>/<aspect>``  protobuf or json         the same version to look at: see `drawing`
 ==============================  =======================  =========================================
 
 The log time of a message is the stamp of the commit, its publish time the capture stamp (that of
@@ -25,7 +25,7 @@ its last whole chunk.
 module          what it does
 ==============  ==================================================================================
 `exact`         a version ↔ the bytes of its exact message
-`pictures`      a datum as messages of Foxglove's schemas (`geometry`: of arrays) or as JSON
+`drawing`       a datum as messages of Foxglove's schemas, or as JSON
 `file`          the MCAP file, chunk by chunk; `disk` is the thread that writes it
 `reading`       a file back, as far as it is whole
 `recorder`      follows a cell and records it

@@ -6,8 +6,7 @@ from functools import partial
 import pytest
 
 from enact_dist import local
-from enact_dist.bench.floors import QUERY
-from enact_dist.bench.layers import (
+from enact_dist.bench.cases.layers import (
     CALLS,
     CLIENT,
     DECISIONS,
@@ -20,8 +19,9 @@ from enact_dist.bench.layers import (
     Watch,
     layer_times_us,
 )
-from enact_dist.bench.payloads import entity, fetch, floats, store
-from enact_dist.bench.updates import slots, update
+from enact_dist.bench.cases.payloads import entity, fetch, floats, store
+from enact_dist.bench.cases.updates import slots, update
+from enact_dist.bench.floors import QUERY
 from enact_dist.core.protocol.messages import Acquire, Commit, Committed, Granted
 from enact_dist.core.shard.shard import Shard
 from enact_dist.link.client.locks import CellClient

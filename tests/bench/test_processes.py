@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 
-from enact_dist.bench import history, memory, pipeline
-from enact_dist.bench.command import BENCHES
-from enact_dist.bench.decisions import Decider, granted_of, hand_over_us
-from enact_dist.bench.floors import ECHO, FDATASYNC, PUBLISH, QUERY, Floors
-from enact_dist.bench.pipeline_worker import (
+from enact_dist.bench.cases import history, memory, pipeline
+from enact_dist.bench.cases.decisions import Decider, granted_of, hand_over_us
+from enact_dist.bench.cases.pipeline_worker import (
     CAMERAS,
     FRAMES,
     areas_of_frames,
@@ -16,9 +14,11 @@ from enact_dist.bench.pipeline_worker import (
     mask_of,
     tick_of_set,
 )
+from enact_dist.bench.cases.updates import slots, update
+from enact_dist.bench.command import BENCHES
+from enact_dist.bench.floors import ECHO, FDATASYNC, PUBLISH, QUERY, Floors
 from enact_dist.bench.place import EMBEDDED, Place, environment
 from enact_dist.bench.run import Run
-from enact_dist.bench.updates import slots, update
 from enact_dist.core.protocol.datum import Slot
 from enact_dist.errors import MisuseError
 

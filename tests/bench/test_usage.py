@@ -5,7 +5,7 @@ import os
 
 import pytest
 
-from enact_dist.bench.pipeline_ticks import ticks_of
+from enact_dist.bench.cases.pipeline import ticks_of
 from enact_dist.bench.usage import Sampled, Usage, Used, folder_use, private_bytes, slope
 
 MS = 1_000_000

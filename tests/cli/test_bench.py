@@ -13,7 +13,8 @@ from types import SimpleNamespace
 import pytest
 
 from enact_dist import Aspect, Entity, Lock, View, connect
-from enact_dist.bench import command, history, updates
+from enact_dist.bench import command
+from enact_dist.bench.cases import history, updates
 from enact_dist.bench.place import Place
 from enact_dist.bench.rows import Row
 from enact_dist.bench.run import Answer
@@ -425,7 +426,7 @@ def test_help_says_of_every_bench_what_it_measures(enact, capsys, words):
 
 def test_goal_that_is_missed_is_told_and_is_no_failure(enact, monkeypatch):
     """An honest NO, with status 0."""
-    monkeypatch.setattr("enact_dist.bench.decisions.hand_over_us", lambda _seconds_s: [5e3])
+    monkeypatch.setattr("enact_dist.bench.cases.decisions.hand_over_us", lambda _seconds_s: [5e3])
 
     result = enact("bench", "core", "--json", *SHORT)
 
@@ -504,7 +505,7 @@ def test_daemons_of_a_killed_bench_end(tmp_path):
     )
     try:
         deadline_s = time.monotonic() + 60
-        while not processes_of(tmp_path, b"enact_dist.bench.worker"):  # its shard serves
+        while not processes_of(tmp_path, b"enact_dist.bench.cases.worker"):  # its shard serves
             assert time.monotonic() < deadline_s
             time.sleep(0.01)
         assert processes_of(tmp_path, b"shard")

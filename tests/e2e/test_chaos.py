@@ -21,8 +21,8 @@ from enact_dist.errors import LinkError
 from enact_dist.verify.chaos import daemon, evidence, faults, runner
 from enact_dist.verify.chaos.cell import TestedCell
 from enact_dist.verify.chaos.figures import judge
-from enact_dist.verify.chaos.hosts import Loopback, open_hosts
 from enact_dist.verify.chaos.journal import Journal
+from enact_dist.verify.chaos.network.hosts import Loopback, open_hosts
 from enact_dist.verify.checker import Told
 from enact_dist.verify.daemons import LineProcess
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from enact_dist.errors import LinkError
-from enact_dist.verify.chaos.hosts import open_hosts
+from enact_dist.verify.chaos.network.hosts import open_hosts
 
 pytestmark = [pytest.mark.slow, pytest.mark.carrier("auto")]
 """One program is on the host of a shard, the other far away: each takes what there is."""

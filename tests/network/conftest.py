@@ -12,7 +12,7 @@ sys.path.append(str(HERE))  # not first: other folders have a conftest, too
 from network_site import SHARDS, Site  # noqa: E402 - found by the line above
 
 from enact_dist.errors import LinkError  # noqa: E402
-from enact_dist.verify.chaos.switch import Cable  # noqa: E402
+from enact_dist.verify.chaos.network.switch import Cable  # noqa: E402
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,8 @@ from pathlib import Path
 from enact_dist.verify.chaos.cell import END_S, TestedCell
 from enact_dist.verify.chaos.evidence import FAULTS, SETTINGS, load
 from enact_dist.verify.chaos.figures import judge
-from enact_dist.verify.chaos.hosts import open_hosts
 from enact_dist.verify.chaos.journal import SUFFIX, Journal
+from enact_dist.verify.chaos.network.hosts import open_hosts
 from enact_dist.verify.daemons import LineProcess
 
 HERE = Path(__file__).parent

@@ -12,7 +12,7 @@ from network_site import LONG_S, SHARDS, TTL_S
 
 from enact_dist import local
 from enact_dist.actor.running.process import ActorThread, actor_command
-from enact_dist.verify.chaos.switch import Cable
+from enact_dist.verify.chaos.network.switch import Cable
 from enact_dist.verify.daemons import COMMAND
 
 pytestmark = pytest.mark.network

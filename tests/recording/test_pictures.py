@@ -12,9 +12,9 @@ from recording_samples import BEGIN_NS, Cloud, Mesh, data, datum, recorded
 from enact_dist.config.shows import GUESSED, KINDS, Shows
 from enact_dist.core.protocol.datum import Slot
 from enact_dist.errors import ConfigError
+from enact_dist.recording.drawing.geometry import quaternion
+from enact_dist.recording.drawing.pictures import json_bytes, json_schema, pictures_of
 from enact_dist.recording.exact import Recorded
-from enact_dist.recording.geometry import quaternion
-from enact_dist.recording.pictures import json_bytes, json_schema, pictures_of
 
 TRIANGLE_M = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0.5]], np.float32)
 TURNED = np.array([[0.0, -1, 0, 0.1], [1, 0, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]])

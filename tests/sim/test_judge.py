@@ -12,9 +12,9 @@ from enact_dist.core.protocol.messages import AspectEntry, Refused, Register
 from enact_dist.core.protocol.records import Persist, Persisted, PreparedEnded, PreparedRecord, Tick
 from enact_dist.terms import Durability
 from enact_dist.verify.simulation.faults import NONE
-from enact_dist.verify.simulation.growth_judge import NEWER, NEWER_ENCODING, OLDER
+from enact_dist.verify.simulation.hosts.world import S, SimulationError
+from enact_dist.verify.simulation.judges.growth import NEWER, NEWER_ENCODING, OLDER
 from enact_dist.verify.simulation.scenario import Scenario
-from enact_dist.verify.simulation.world import S, SimulationError
 
 STRANGER = LockId("stranger", 0, 1)
 

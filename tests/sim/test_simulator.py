@@ -11,13 +11,13 @@ from enact_dist.core.protocol.messages import Item, PlacementMap, ShardEntry
 from enact_dist.core.protocol.placement import shard_of
 from enact_dist.core.protocol.records import Persist, SessionRecord
 from enact_dist.terms import Access, Durability
-from enact_dist.verify.simulation.disk import Disk
 from enact_dist.verify.simulation.faults import NONE, drawn
-from enact_dist.verify.simulation.history import conflict
+from enact_dist.verify.simulation.hosts.disk import Disk
+from enact_dist.verify.simulation.hosts.world import Clock, Host, S, World
+from enact_dist.verify.simulation.judges.history import conflict
 from enact_dist.verify.simulation.scenario import Scenario
 from enact_dist.verify.simulation.schedule import Schedule
-from enact_dist.verify.simulation.workload import ENTITIES
-from enact_dist.verify.simulation.world import Clock, Host, S, World
+from enact_dist.verify.simulation.work.workload import ENTITIES
 
 R, W, RE, WE, V = (
     Access.READ,

@@ -7,8 +7,9 @@ import pytest
 
 from enact_dist.errors import ConfigError, LinkError
 from enact_dist.terms import Access
-from enact_dist.verify.chaos import chains, evidence, figures, hosts, watcher
+from enact_dist.verify.chaos import chains, evidence, figures, watcher
 from enact_dist.verify.chaos.journal import SUFFIX, UNSEEN, Journal, read_lines
+from enact_dist.verify.chaos.network import hosts
 from enact_dist.verify.checker import Told
 
 KEPT, OTHER, FRAME = (

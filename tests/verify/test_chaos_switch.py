@@ -9,7 +9,7 @@ import threading
 import pytest
 
 from enact_dist.errors import MisuseError
-from enact_dist.verify.chaos.switch import QUEUE_S, Cable, Counts, Switch, _Way, address
+from enact_dist.verify.chaos.network.switch import QUEUE_S, Cable, Counts, Switch, _Way, address
 
 MS = 1_000_000
 EVERYBODY = "ff:ff:ff:ff:ff:ff"

@@ -7,7 +7,7 @@ import pytest
 
 from enact_dist.config.read import load_config
 from enact_dist.errors import LinkError
-from enact_dist.verify.chaos.hosts import Loopback
+from enact_dist.verify.chaos.network.hosts import Loopback
 from enact_dist.verify.chaos.watcher import Watcher
 from enact_dist.verify.checker import Told
 from enact_dist.verify.daemons import CellProcesses, LineProcess, last_said

@@ -19,8 +19,8 @@ from enact_dist.verify.daemons import LineProcess
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from enact_dist.verify.chaos.hosts import Hosts
     from enact_dist.verify.chaos.journal import Journal
+    from enact_dist.verify.chaos.network.hosts import Hosts
 
 WATCHER: Final = "watcher"
 CLIENT: Final = "enact_dist.verify.chaos.client"

@@ -28,14 +28,14 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.errors import LinkError
 from enact_dist.verify.chaos.cell import END_S
-from enact_dist.verify.chaos.switch import Cable
+from enact_dist.verify.chaos.network.switch import Cable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from enact_dist.verify.chaos.cell import Client, TestedCell
-    from enact_dist.verify.chaos.hosts import Hosts
     from enact_dist.verify.chaos.journal import Journal
+    from enact_dist.verify.chaos.network.hosts import Hosts
 
 KILL_SHARD, KILL_CLIENT = "kill shard", "kill client"
 STOP_SHARD, STOP_CLIENT = "stop shard", "stop client"

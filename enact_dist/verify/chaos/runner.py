@@ -14,8 +14,8 @@ from enact_dist.verify.chaos import daemon
 from enact_dist.verify.chaos.cell import END_S, TestedCell
 from enact_dist.verify.chaos.evidence import FAULTS, SETTINGS
 from enact_dist.verify.chaos.faults import DECK, Injector
-from enact_dist.verify.chaos.hosts import open_hosts
 from enact_dist.verify.chaos.journal import Journal
+from enact_dist.verify.chaos.network.hosts import open_hosts
 from enact_dist.verify.checker import Told
 
 if TYPE_CHECKING:

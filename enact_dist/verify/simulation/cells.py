@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from enact_dist.verify.simulation import faults as fault_options
-from enact_dist.verify.simulation.world import MS, S
+from enact_dist.verify.simulation.hosts.world import MS, S
 
 if TYPE_CHECKING:
     from random import Random

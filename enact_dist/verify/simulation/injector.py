@@ -11,18 +11,18 @@ from typing import TYPE_CHECKING
 
 from enact_dist.core.protocol.messages import Goodbye
 from enact_dist.core.protocol.records import Drain, SessionDied
-from enact_dist.verify.simulation.client_host import ClientHost
-from enact_dist.verify.simulation.shard_host import ShardHost
-from enact_dist.verify.simulation.world import MS, Host, S
+from enact_dist.verify.simulation.hosts.client_host import ClientHost
+from enact_dist.verify.simulation.hosts.shard_host import ShardHost
+from enact_dist.verify.simulation.hosts.world import MS, Host, S
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from enact_dist.core.protocol.messages import Commit
     from enact_dist.verify.simulation.cells import CellPlan
-    from enact_dist.verify.simulation.network import Network
+    from enact_dist.verify.simulation.hosts.network import Network
+    from enact_dist.verify.simulation.hosts.world import World
     from enact_dist.verify.simulation.schedule import Place
-    from enact_dist.verify.simulation.world import World
 
     Act = Callable[[Random], str]
 

@@ -18,19 +18,19 @@ from enact_dist.core.shard.state import ShardSettings
 from enact_dist.verify.simulation import cells
 from enact_dist.verify.simulation import faults as fault_options
 from enact_dist.verify.simulation.cells import CONTEXTS, WORK_NS
-from enact_dist.verify.simulation.client_host import ClientHost
-from enact_dist.verify.simulation.forks import Forker
-from enact_dist.verify.simulation.graph import Graph
-from enact_dist.verify.simulation.historian import Historian
-from enact_dist.verify.simulation.history import History
+from enact_dist.verify.simulation.hosts.client_host import ClientHost
+from enact_dist.verify.simulation.hosts.network import Network
+from enact_dist.verify.simulation.hosts.payloads import DRAFT_NS
+from enact_dist.verify.simulation.hosts.shard_host import ShardHost
+from enact_dist.verify.simulation.hosts.world import MS, S, SimulationError, World
 from enact_dist.verify.simulation.injector import Injector
-from enact_dist.verify.simulation.model import Model
-from enact_dist.verify.simulation.network import Network
-from enact_dist.verify.simulation.payloads import DRAFT_NS
+from enact_dist.verify.simulation.judges.graph import Graph
+from enact_dist.verify.simulation.judges.history import History
+from enact_dist.verify.simulation.judges.model import Model
 from enact_dist.verify.simulation.schedule import WHOLE, Happening, Part, Schedule
-from enact_dist.verify.simulation.shard_host import ShardHost
-from enact_dist.verify.simulation.workload import ASPECTS, Workload
-from enact_dist.verify.simulation.world import MS, S, SimulationError, World
+from enact_dist.verify.simulation.work.forks import Forker
+from enact_dist.verify.simulation.work.historian import Historian
+from enact_dist.verify.simulation.work.workload import ASPECTS, Workload
 
 if TYPE_CHECKING:
     from collections import Counter
@@ -115,7 +115,7 @@ class Scenario:
             host = shards[name] = ShardHost(
                 self.world, settings, self.cell.faults, wall_offset_ns=offset_ns
             )
-            host.model = self.model
+            host.judge = self.model
             host.tokens = self._tokens_seen
             host.network, host.peers = self.network, shards
         return shards
@@ -129,7 +129,7 @@ class Scenario:
             name,
             network=self.network,
             shards=self.shards,
-            model=self.model,
+            check_beliefs=self.model.of_clients.check_beliefs,
             faults=self.cell.faults,
             ttl_ns=self.cell.ttl_ns,
         )

@@ -7,7 +7,7 @@ import pytest
 from actors.palletizing import packing_scores, perception_scores
 from actors.palletizing.packing_records import Judgement, Packed
 from actors.palletizing.perception_scores import Scored
-from enact_dist.bench.palletizing import run_palletizing
+from enact_dist.bench.cases.palletizing import run_palletizing
 from enact_dist.bench.run import Asked
 from enact_dist.errors import MisuseError
 

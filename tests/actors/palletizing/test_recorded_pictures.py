@@ -11,8 +11,8 @@ from actors.palletizing import vocabulary
 from actors.palletizing.vocabulary import Observation, Plan, Sighting, Viewpoint
 from enact_dist.config.read import load_config
 from enact_dist.core.protocol.datum import Slot
+from enact_dist.recording.drawing.pictures import pictures_of
 from enact_dist.recording.exact import Recorded
-from enact_dist.recording.pictures import pictures_of
 from enact_dist.wire.payload import encode_datum
 
 POSE = np.eye(4)

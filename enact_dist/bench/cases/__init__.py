@@ -1,0 +1,1 @@
+"""The benches: each measures its cases and adds their rows to a run."""

@@ -1,0 +1,1 @@
+"""What the simulated cell runs on: time, processes, network and disks around the real core."""

@@ -1,0 +1,230 @@
+"""The process around one real `Shard`: carries out its effects, ticks it, dies and comes back."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING, Protocol, cast
+
+from enact_dist.core.protocol.messages import Answer, Finish, Refused, Request, Stage
+from enact_dist.core.protocol.records import (
+    Call,
+    Called,
+    Persist,
+    Persisted,
+    Reply,
+    SessionSeen,
+    Tick,
+)
+from enact_dist.core.shard.shard import Shard
+from enact_dist.verify.simulation.hosts.disk import Disk
+from enact_dist.verify.simulation.hosts.payloads import ShardPayloads, as_kept
+from enact_dist.verify.simulation.hosts.world import MS, Host, S
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from random import Random
+
+    from enact_dist.core.protocol.records import Effect, Event, Recovered
+    from enact_dist.core.shard.state import ShardSettings
+    from enact_dist.verify.simulation.faults import Faults
+    from enact_dist.verify.simulation.hosts.network import Network
+    from enact_dist.verify.simulation.hosts.world import World
+
+
+ASSERT_EVERY = 4
+"""Steps between two looks at the shard's own assertions; the judge looks at each step."""
+
+
+class ShardJudge(Protocol):
+    """Looks at each step of a shard, and at its crashes and starts."""
+
+    def booted(self, host: ShardHost, recovered: Recovered, *, crashed_at_ns: int) -> None:
+        """A shard has started with what its disk kept."""
+
+    def judge_prefixes(self, host: ShardHost, *, power_cut: bool) -> None:
+        """A shard is about to lose what a crash may take."""
+
+    def crashed(self, host: ShardHost, lost: list[Persist], *, power_cut: bool) -> None:
+        """A shard has died, and its disk has lost these records."""
+
+    def handled(self, host: ShardHost, message: object, effects: Sequence[Effect]) -> None:
+        """A shard has taken a message and decided."""
+
+
+class ShardHost(Host):
+    """A shard daemon.  `asked` are the requests that it has not answered yet, by their handles."""
+
+    def __init__(
+        self, world: World, settings: ShardSettings, faults: Faults, *, wall_offset_ns: int
+    ) -> None:
+        super().__init__(
+            world, settings.name, drift_ppm=faults.drift_ppm, wall_offset_ns=wall_offset_ns
+        )
+        self.settings = settings
+        self.faults = faults
+        self.disk = Disk(world, faults, settings.name)
+        self.asserts = True
+        self.judge: ShardJudge
+        self.shard: Shard
+        self.payloads: ShardPayloads
+        self.tokens: Callable[[ShardHost], list[str]] = lambda _host: []
+        self.on_persist: Callable[[ShardHost], None] = lambda _host: None
+        self.on_decision: Callable[[ShardHost, list[str]], None] = lambda _host, _told: None
+        self.network: Network
+        self.peers: dict[str, ShardHost] = {}
+        self.asked: dict[int, Request] = {}
+        self._replies: dict[int, Callable[[Answer], None]] = {}
+        self._handle = self._steps = 0
+        self._stalled = False
+        self._inbox: list[tuple[Request | Event, int]] = []
+        self._tick_due_ns = 0
+        self._crashed_at_ns = 0
+
+    # ---------------------------------------------------------------- life
+
+    def boot(self) -> None:
+        """Start with what the disk has kept."""
+        self.up = True
+        self.clock = self.new_clock()
+        recovered = self.disk.recovered(unix_s=self.wall_ns // S)
+        self._replies.clear()
+        self.asked.clear()
+        self.shard = Shard(self.settings, recovered, now_ns=self.local_ns, wall_ns=self.wall_ns)
+        self.payloads = ShardPayloads(self, self.shard)
+        self.judge.booted(self, recovered, crashed_at_ns=self._crashed_at_ns)
+        self._tick_due_ns = 0
+        self._plan_tick()
+        for session in self.tokens(self):
+            self.later(10 * MS, partial(self.event, SessionSeen(session, True)))
+        if self.shard.epoch != 1:
+            self.world.tally["epoch changes"] += 1
+        self.world.tell(f"{self.name} starts with epoch {self.shard.epoch}")
+
+    def crash(self, *, power_cut: bool, down_ns: int, luck: Random) -> None:
+        """Die now and come back after a while."""
+        if not self.up:
+            return
+        self.world.tally["power cuts" if power_cut else "crashes"] += 1
+        self.end_life()
+        self._stalled = False
+        self._inbox.clear()
+        self._crashed_at_ns = self.world.now_ns
+        self._tally_counters()
+        self.judge.judge_prefixes(self, power_cut=power_cut)
+        lost = self.disk.crash(power_cut=power_cut, luck=luck)
+        self.judge.crashed(self, lost, power_cut=power_cut)
+        self.world.after(down_ns, self.boot)
+
+    def _tally_counters(self) -> None:
+        for name, count in self.shard.counters.items():
+            self.world.tally[f"shard: {name}"] += count
+
+    def stall(self, true_ns: int) -> bool:
+        """Let the dispatcher stand still for a while, and nothing else of this host.
+
+        The disk goes on, and what it reports waits with the requests.  False if it stalls already.
+        """
+        if self._stalled or self.paused or not self.up:
+            return False
+        self._stalled = True
+        life = self.life
+        self.world.after(true_ns, lambda: self._do(life, self.go_on))
+        return True
+
+    def go_on(self) -> None:
+        """End a stall: what has come in is handled first, then the time is looked at."""
+        self._stalled = False
+        inbox, self._inbox = self._inbox, []
+        for message, handle in inbox:
+            if not isinstance(message, Tick):
+                self._give(message, handle)
+        if self.up and inbox:
+            self._give(Tick(), 0)
+
+    def close(self) -> None:
+        """Add this shard's own statistics to those of the run."""
+        self._tally_counters()
+
+    # ---------------------------------------------------------------- messages in, effects out
+
+    def request(self, message: Request, reply: Callable[[Answer], None]) -> None:
+        """Hand a request to the shard; exactly one answer must come, now or later."""
+        if isinstance(message, Stage):
+            reply(self.payloads.stage(message))
+            return
+        self._handle += 1
+        self._replies[self._handle], self.asked[self._handle] = reply, message
+        self._give(self.payloads.with_bodies(message), self._handle)
+
+    def event(self, event: Event) -> None:
+        """Hand an event of this host to the shard."""
+        self._give(event, 0)
+
+    def _give(self, message: Request | Event, handle: int) -> None:
+        if self._stalled:
+            self._inbox.append((message, handle))
+            return
+        now_ns, wall_ns = self.local_ns, self.wall_ns
+        if isinstance(message, Tick):
+            self.payloads.look()
+        effects = [
+            as_kept(effect)
+            for effect in self.shard.handle(
+                message, reply_to=handle, now_ns=now_ns, wall_ns=wall_ns
+            )
+        ]
+        self._steps += 1
+        if self.asserts and self._steps % ASSERT_EVERY == 0:
+            self.shard.assert_invariants()
+        self.judge.handled(self, message, effects)
+        for effect in effects:
+            if isinstance(effect, Reply):
+                reply = self._replies.pop(effect.reply_to, None)
+                self.asked.pop(effect.reply_to, None)
+                if reply is None:
+                    self.world.violation("one answer per request", self.name, effect.answer)
+                    return
+                if isinstance(effect.answer, Refused):
+                    self.world.tally[f"refused: {effect.answer.code}"] += 1
+                reply(cast("Answer", effect.answer))
+            elif isinstance(effect, Persist):
+                self.disk.submit(self, effect, lambda ticket: self.event(Persisted(ticket)))
+                self.on_persist(self)
+            elif isinstance(effect, Call):
+                self._call(effect)
+        told = [e.shard for e in effects if isinstance(e, Call) and isinstance(e.request, Finish)]
+        if told:
+            self.on_decision(self, told)
+        self._plan_tick()
+
+    def _call(self, call: Call) -> None:
+        """Ask another shard over the same bad network; no answer needs no report."""
+        peer, network = self.peers[call.shard], self.network
+
+        def answered(answer: Answer) -> None:
+            if self.up:
+                self.event(Called(call.shard, call.request, answer))
+
+        def reply(answer: Answer) -> None:
+            network.send(peer, self, answer, answered)
+
+        request = cast("Request", call.request)
+        network.send(self, peer, request, lambda came: peer.request(came, reply))
+
+    def _plan_tick(self) -> None:
+        now_ns = self.local_ns
+        due_ns = max(self.shard.next_deadline_ns(), now_ns + MS)
+        if self._tick_due_ns > now_ns and self._tick_due_ns <= due_ns:
+            return
+        self._tick_due_ns = due_ns
+        self.later(due_ns - now_ns, lambda: self._tick(due_ns))
+
+    def _tick(self, due_ns: int) -> None:
+        if due_ns == self._tick_due_ns:
+            self._tick_due_ns = 0
+            self.event(Tick())
+
+    @property
+    def unanswered(self) -> int:
+        """How many requests have had no answer yet."""
+        return len(self._replies)
