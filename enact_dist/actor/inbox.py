@@ -15,10 +15,11 @@ import time
 from typing import TYPE_CHECKING, Final, Generic, Self, TypeVar
 
 from enact_dist.access.session import session_of
-from enact_dist.access.together import Captured, captured_versions
+from enact_dist.access.sets import Captured, PendingSets
+from enact_dist.access.together import captured_versions
+from enact_dist.access.trigger import Trigger
 from enact_dist.actor.report import Repeated
-from enact_dist.actor.sets import PendingSets
-from enact_dist.actor.triggers import BackOff, PendingTriggers, Trigger
+from enact_dist.actor.triggers import BackOff, PendingTriggers
 from enact_dist.errors import LinkError
 from enact_dist.link.clock import monotonic_ns
 from enact_dist.patterns import pattern_matches
@@ -26,9 +27,9 @@ from enact_dist.patterns import pattern_matches
 if TYPE_CHECKING:
     from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 
+    from enact_dist.access.sets import IncompleteSet
     from enact_dist.access.watch import Change, Watch
     from enact_dist.actor.binding import BoundActor, Watched
-    from enact_dist.actor.sets import IncompleteSet
     from enact_dist.terms import Entity
 
 log = logging.getLogger("enact.actor")

@@ -27,7 +27,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from enact_dist.access.lock import Lock
-from enact_dist.access.newer import Newer
+from enact_dist.access.trigger import Newer
 from enact_dist.actor.inbox import Inbox
 from enact_dist.actor.outcome import Outcome, Seen, is_new
 from enact_dist.actor.running.user_code import place_of

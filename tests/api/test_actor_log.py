@@ -6,13 +6,12 @@ import threading
 
 import pytest
 
-from enact_dist.access.together import Captured
+from enact_dist.access.sets import Captured, PendingSets
 from enact_dist.actor import report
 from enact_dist.actor.actor import Actor
 from enact_dist.actor.inbox import SetInbox
 from enact_dist.actor.report import KINDS_MAX, PAUSE_NS_MAX, PAUSE_NS_MIN, Repeated, kind_of
 from enact_dist.actor.running.runner import run_actor
-from enact_dist.actor.sets import PendingSets
 from enact_dist.errors import SHARD_RESTARTED, LeaseLostError
 from enact_dist.terms import Aspect, Entity, World, Write
 from enact_dist.world.connecting import local

@@ -8,8 +8,7 @@ from collections import Counter
 import pytest
 
 from enact_dist import Entity
-from enact_dist.access.together import Captured
-from enact_dist.actor.sets import PendingSets
+from enact_dist.access.sets import Captured, PendingSets
 
 NAMES = ("left", "middle", "right")
 LEFT, MIDDLE, RIGHT = range(3)

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.actor.running.drain import CUT_OFF, Drain
 from enact_dist.actor.running.stop import LOOK_S, StopWithPulse
-from enact_dist.operate.supervise import NEVER_AGAIN, Pauses
+from enact_dist.operate.supervise import NEVER_AGAIN, RestartPauses
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -170,7 +170,7 @@ class ActorGroup:
 
     def _keep(self, name: str) -> None:
         """Run an actor, and run it again, in its thread."""
-        pauses = Pauses()
+        pauses = RestartPauses()
         try:
             while (life := self._begun(name)) is not None:
                 pauses.started()
@@ -206,7 +206,7 @@ class ActorGroup:
             self._serving.discard(name)
         self._heard_of(name)
 
-    def _again(self, name: str, status: int, pauses: Pauses) -> bool:
+    def _again(self, name: str, status: int, pauses: RestartPauses) -> bool:
         """Tell of the end of an actor; wait and return True where it is to be started again."""
         if status == DONE:
             log.info("actor %s is done; it is not started again", name)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.access.together import Captured, newest_set_ns
+from enact_dist.access.sets import Captured, newest_set_ns
 from enact_dist.core.protocol.datum import Slot
 from enact_dist.core.protocol.messages import AwaitStamp, Reached, Survey, Surveyed
 from enact_dist.core.protocol.placement import shard_of
