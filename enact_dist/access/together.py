@@ -31,7 +31,7 @@ import math
 from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 from enact_dist.access.reads import slot_of
-from enact_dist.access.sets import Captured, PendingSets, newest_set_ns
+from enact_dist.access.sets import Capture, PendingSets, newest_set_ns
 from enact_dist.core.protocol.messages import Survey, Surveyed
 from enact_dist.errors import ProtocolError
 from enact_dist.terms import Entity, View
@@ -165,7 +165,7 @@ class Together(Generic[T_co]):
             for request, stamp_ns in zip(self.requests, members, strict=True)
         }
 
-    def newest(self, versions: Sequence[Sequence[Captured]]) -> tuple[int, ...]:
+    def newest(self, versions: Sequence[Sequence[Capture]]) -> tuple[int, ...]:
         """Return the capture stamp of each datum of the newest set; None if there is none."""
         if not self.within_s and self.least == len(self.requests):
             stamp_ns = newest_set_ns(versions)
@@ -176,7 +176,7 @@ class Together(Generic[T_co]):
         return trigger.members if trigger is not None else ()
 
 
-def captured_versions(session: Session, requests: Sequence[View[Any]]) -> list[list[Captured]]:
+def captured_versions(session: Session, requests: Sequence[View[Any]]) -> list[list[Capture]]:
     """Return the retained versions of each request's slot, oldest first, the newest included.
 
     Whatever this process has committed is among them; else it is no cut.
@@ -191,7 +191,7 @@ def captured_versions(session: Session, requests: Sequence[View[Any]]) -> list[l
         tuple(dict.fromkeys(slot.aspect for slot in slots)),
         retained=True,
     )
-    found: dict[Slot, list[Captured]] = {slot: [] for slot in slots}
+    found: dict[Slot, list[Capture]] = {slot: [] for slot in slots}
     shards = sorted(session.shards_of(requests))
     for shard in shards:
         session.settle(shard)
@@ -201,7 +201,7 @@ def captured_versions(session: Session, requests: Sequence[View[Any]]) -> list[l
         for state in answer.states:
             if state.slot in found and state.version:
                 found[state.slot].append(
-                    Captured(
+                    Capture(
                         state.version, state.stamp_ns, state.captured_ns, bool(state.null_reason)
                     )
                 )

@@ -15,7 +15,7 @@ import time
 from typing import TYPE_CHECKING, Final, Generic, Self, TypeVar
 
 from enact_dist.access.session import session_of
-from enact_dist.access.sets import Captured, PendingSets
+from enact_dist.access.sets import Capture, PendingSets
 from enact_dist.access.together import captured_versions
 from enact_dist.access.trigger import Trigger
 from enact_dist.actor.report import Repeated
@@ -131,7 +131,7 @@ class SetInbox(_Box[PendingSets]):
         """The account of the sets, for its counters."""
         return self._pending
 
-    def start(self, versions: Sequence[Sequence[Captured]]) -> None:
+    def start(self, versions: Sequence[Sequence[Capture]]) -> None:
         """Take what there is when the actor starts."""
         with self._filled:
             self._pending.start(versions, monotonic_ns())
@@ -141,7 +141,7 @@ class SetInbox(_Box[PendingSets]):
         with self._filled:
             return self._pending.misses(member, version)
 
-    def captured(self, member: int, versions: Sequence[Captured]) -> None:
+    def captured(self, member: int, versions: Sequence[Capture]) -> None:
         """Take versions of one member of the set, oldest first."""
         with self._filled:
             before, unstamped = self._pending.incomplete, self._pending.unstamped_from
@@ -311,7 +311,7 @@ class Watching:
     def _note_in_set(self, inbox: SetInbox, member: int, change: Change) -> None:
         """Take a change of a set's member; where versions were missed, what is retained of it."""
         versions = [
-            Captured(change.version, change.position.stamp_ns, change.captured_ns, change.null)
+            Capture(change.version, change.position.stamp_ns, change.captured_ns, change.null)
         ]
         if inbox.misses(member, change.version):
             view = self._bound.set_views()[member]

@@ -48,7 +48,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.config.environment import with_environment
 from enact_dist.config.lines import LineLocator
-from enact_dist.config.table import Source, Table, suggestion
+from enact_dist.config.table import ConfigSource, Table, suggestion
 from enact_dist.config.types import ActorProcess, CellConfig, ShardConfig, is_wildcard
 from enact_dist.errors import ConfigError
 
@@ -107,7 +107,7 @@ def parse_config(
         found = re.search(r"at line (\d+)", str(error))
         line = int(found[1]) if found else max(1, len(text.splitlines()))
         raise ConfigError(f"{shown}, line {line}: {error}", path=shown, line=line) from error
-    root = Table(values, (), Source(shown, LineLocator(text), file.parent))
+    root = Table(values, (), ConfigSource(shown, LineLocator(text), file.parent))
     config = _cell(root, file)
     return with_environment(config, os.environ if environment is None else environment)
 

@@ -138,7 +138,7 @@ def suggestion(found: str, known: Iterable[str]) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class ConfigSource:
     """Where a configuration comes from.
 
     Attributes:
@@ -163,7 +163,7 @@ class Table:
 
     values: Mapping[str, Any]
     where: Place
-    source: Source
+    source: ConfigSource
 
     @property
     def title(self) -> str:
