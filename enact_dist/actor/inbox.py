@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, Generic, Self, TypeVar
 from enact_dist.access.session import session_of
 from enact_dist.access.sets import Capture, PendingSets
 from enact_dist.access.together import captured_versions
-from enact_dist.actor.report import Repeated
+from enact_dist.actor.report import ERROR_LENGTH_MAX, Repeated
 from enact_dist.actor.triggers import BackOff, PendingTriggers
 from enact_dist.errors import LinkError
 from enact_dist.link.clock import monotonic_ns
@@ -201,6 +201,19 @@ class SetInbox(_Box[PendingSets]):
     def _count(self, how: str, incomplete: IncompleteSet) -> int | None:
         """Return the count to report now for sets without the same data, as `Repeated`."""
         return self._repeated.tell((how, incomplete.missing), str(incomplete), monotonic_ns())
+
+    def counts(self) -> dict[str, object]:
+        """Return what `ActorStatistics` shows of the sets."""
+        sets = self._pending
+        return {
+            "incomplete": sets.incomplete,
+            "last_incomplete": str(sets.told[-1])[:ERROR_LENGTH_MAX] if sets.told else "",
+            "late": sets.late,
+            "unstamped": sets.unstamped,
+            "unstamped_from": ", ".join(sets.unstamped_from)[:ERROR_LENGTH_MAX],
+            "partial": sets.partial,
+            "last_partial": sets.last_partial[:ERROR_LENGTH_MAX],
+        }
 
     def tell_left(self) -> None:
         """Tell of the incomplete sets that were only counted so far."""

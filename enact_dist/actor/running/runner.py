@@ -30,7 +30,7 @@ import math
 import random
 import threading
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.actor.actor import Actor, check_period, name_of
 from enact_dist.actor.binding import BoundActor
@@ -49,7 +49,6 @@ from enact_dist.actor.running.doing import Doing
 from enact_dist.actor.running.load import shown_values
 from enact_dist.actor.triggers import BackOff, FixedRate
 from enact_dist.errors import (
-    CommitUnknownError,
     LeaseLostError,
     LinkError,
     LockTimeoutError,
@@ -172,39 +171,24 @@ class ActorRun:
 
     def statistics(self) -> ActorStatistics:
         """Return what the actor has done so far."""
-        self._record.skipped = self._inbox.skipped
-        statistics = dataclasses.replace(
-            self._record.snapshot(monotonic_ns()),
-            writes=self._bound.writes()[:WRITES_MAX],
-            args=shown_values(self._actor),
-            words_in=self.words_in if self._listens else "",
-            word=self._word,
-        )
+        inbox = self._sets or self._inbox
+        self._record.skipped = inbox.skipped
+        more: dict[str, Any] = {
+            "writes": self._bound.writes()[:WRITES_MAX],
+            "args": shown_values(self._actor),
+            "words_in": self.words_in if self._listens else "",
+            "word": self._word,
+        }
         if (call := self.doing.call) is not None and call.method == "update":
             lasted_s, lost = (monotonic_ns() - call.since_ns) / 1e9, call.lock_lost
-            state = "stuck" if lost else statistics.state
-            statistics = dataclasses.replace(
-                statistics, state=state, updating_s=round(lasted_s, 3), lock_lost=lost
-            )
+            more |= {"updating_s": round(lasted_s, 3), "lock_lost": lost}
+            more |= {"state": "stuck"} if lost else {}
         if self._once is not None:
             interrupted, last = self._once.interrupted, self._once.last_interrupted
-            return dataclasses.replace(
-                statistics, interrupted=interrupted, last_interrupted=last[:ERROR_LENGTH_MAX]
-            )
-        if self._sets is None:
-            return statistics
-        sets = self._sets.sets
-        return dataclasses.replace(
-            statistics,
-            skipped=sets.skipped,
-            incomplete=sets.incomplete,
-            last_incomplete=str(sets.told[-1])[:ERROR_LENGTH_MAX] if sets.told else "",
-            late=sets.late,
-            unstamped=sets.unstamped,
-            unstamped_from=", ".join(sets.unstamped_from)[:ERROR_LENGTH_MAX],
-            partial=sets.partial,
-            last_partial=sets.last_partial[:ERROR_LENGTH_MAX],
-        )
+            more |= {"interrupted": interrupted, "last_interrupted": last[:ERROR_LENGTH_MAX]}
+        elif self._sets is not None:
+            more |= self._sets.counts()
+        return dataclasses.replace(self._record.snapshot(monotonic_ns()), **more)
 
     def answer(self, word: str = "") -> None:
         """Report that commands are received, and the result of the newest one."""
@@ -264,7 +248,7 @@ class ActorRun:
             try:
                 ask()
             except LinkError as error:
-                self._record.refused(error, unknown=False)
+                self._record.refused(error)
                 if not refused:
                     log.warning("%s: not ready before its shards answer: %s", self.name, error)
                 self._report()
@@ -409,7 +393,7 @@ class ActorRun:
         return None
 
     def _refused(self, entity: Entity | None, error: Exception) -> None:
-        self._record.refused(error, unknown=isinstance(error, CommitUnknownError))
+        self._record.refused(error)
         recovers = isinstance(error, LeaseLostError) and error.restarted
         level = logging.DEBUG if recovers else logging.WARNING
         log.log(level, "%s%s: refused: %s", self.name, _about(entity), error)
