@@ -34,8 +34,8 @@ from enact_dist.world.connecting import local
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
+    from enact_dist.access.sets import IncompleteSet, PendingSets
     from enact_dist.actor.actor import Actor
-    from enact_dist.actor.sets import IncompleteSet, PendingSets
     from enact_dist.terms import Entity
     from enact_dist.world.cell import Cell
 

@@ -1,6 +1,5 @@
 """The pages of `enact_dist/docs` are true: their programs run, their links lead somewhere."""
 
-import ast
 import re
 import subprocess
 import sys
@@ -8,9 +7,17 @@ from pathlib import Path
 
 import pytest
 
-from enact_dist.config import environment
+from enact_dist.config.environment import variable_of, variables_of
 from enact_dist.config.read import load_config
-from enact_dist.config.shows import SHOWS_KEYS
+from enact_dist.config.table import keys_of
+from enact_dist.config.types import (
+    ActorConfig,
+    AspectConfig,
+    CellConfig,
+    PinTable,
+    RetentionTable,
+    ShardConfig,
+)
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted((ROOT / "enact_dist" / "docs").glob("*.md"))
@@ -68,19 +75,14 @@ def test_page_of_cell_toml_has_every_key_and_no_other():
     page = (ROOT / "enact_dist" / "docs" / "cell.md").read_text("utf-8")
     tables = re.findall(r"^\| key .*\n\|---.*\n((?:\|.*\n)+)", page, re.MULTILINE)
     explained = [set(re.findall(r"^\| `(\w+)` \|", rows, re.MULTILINE)) for rows in tables]
-    source = (ROOT / "enact_dist" / "config" / "read.py").read_text("utf-8")
-    accepted = []
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "refuse_unknown":
-            keys = {arg.value for arg in node.args if isinstance(arg, ast.Constant)}
-            starred = any(isinstance(arg, ast.Starred) for arg in node.args)
-            accepted.append(keys | (set(SHOWS_KEYS) if starred else set()))
+    kinds = (CellConfig, ShardConfig, PinTable, AspectConfig, RetentionTable, ActorConfig)
+    accepted = [set(keys_of(kind)) for kind in kinds]
     lists = {"shards", "pins", "aspects", "actors"}  # headings of the page
     assert sorted(map(sorted, explained)) == sorted(sorted(keys - lists) for keys in accepted)
 
     variables = set(re.findall(r"^\| `(ENACT_\w+)` \|", page, re.MULTILINE))
-    of_shards = {environment.variable_of("name", key) for key in environment._SHARD_KEYS}
-    of_cell = set(environment._CELL_NAMES) - {"ENACT_SHARED_FOLDER"}  # no key of the file
+    of_shards = {variable_of("name", key) for key in variables_of(ShardConfig)}
+    of_cell = {f"ENACT_{key}" for key in variables_of(CellConfig)}
     assert variables == of_cell | of_shards
 
 

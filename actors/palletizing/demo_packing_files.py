@@ -26,8 +26,7 @@ from actors.palletizing.vocabulary import (
 )
 from enact_dist import View, ViewEach
 from enact_dist.actor.check import declarations_of
-from enact_dist.actor.drawing.graph import graph_of
-from enact_dist.actor.drawing.svg import svg_of
+from enact_dist.actor.graph import graph_of, svg_of
 from enact_dist.config.read import load_config
 
 if TYPE_CHECKING:

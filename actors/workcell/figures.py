@@ -22,8 +22,7 @@ from actors.workcell import vocabulary as words
 from actors.workcell.plots import ARM, plan_figure, timeline_figure
 from actors.workcell.truth_of_run import PERIOD_NS, truth_of
 from enact_dist.actor.check import declarations_of
-from enact_dist.actor.drawing.graph import graph_of
-from enact_dist.actor.drawing.svg import svg_of
+from enact_dist.actor.graph import graph_of, svg_of
 from enact_dist.config.read import load_config
 
 if TYPE_CHECKING:

@@ -26,9 +26,8 @@ from enact_dist.access.reads import (
     slot_of,
 )
 from enact_dist.access.session import bind, bound_before
-from enact_dist.access.statistics import LockStatistics
 from enact_dist.access.together import Together
-from enact_dist.access.trigger import Triggered
+from enact_dist.access.trigger import LockStatistics, Triggered
 from enact_dist.access.writes import Asked, Writing, reads_of
 from enact_dist.core.client.plan import Phase
 from enact_dist.core.protocol.messages import SlotVersion

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.access.asking import await_stamp
 from enact_dist.access.reads import slot_of
-from enact_dist.access.together import Together
 from enact_dist.config.table import suggestion
 from enact_dist.core.protocol.datum_types import type_conflict
 from enact_dist.core.protocol.messages import AspectEntry, Item
@@ -378,16 +377,6 @@ def unknown_aspect(name: str, known: Iterable[str]) -> MisuseError:
     )
 
 
-def _remedy(request: object) -> str:
-    """Return what to do with what is no lock request."""
-    if isinstance(request, Together):
-        return (
-            "to lock what belongs to a set, make it the trigger of an Actor; to see the newest"
-            " complete set without a lock, world.view(together)"
-        )
-    return "use Read, Write, View or …Each"
-
-
 def bound_before(requests: tuple[LockRequest[Any], ...]) -> BoundRequests | None:
     """Return what the requests of a lock mean if exactly these were bound before."""
     world = getattr(requests[0], "world", None) if requests else None
@@ -436,7 +425,10 @@ def session_of(requests: tuple[LockRequest[Any], ...], *, view: bool = False) ->
     session: Session | None = None
     for request in requests:
         if not isinstance(request, LockRequest):
-            raise MisuseError(f"{request!r} is no lock request; {_remedy(request)}")
+            raise MisuseError(
+                f"{request!r} is no lock request;"
+                f" {getattr(request, 'remedy', 'use Read, Write, View or …Each')}"
+            )
         found: Session | None = getattr(request.world, "session", None)
         if found is None:
             raise MisuseError(

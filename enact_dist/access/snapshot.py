@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar, overload
 
 from enact_dist.access.arguments import Moment, check_argument
 from enact_dist.access.asking import ask_all
-from enact_dist.access.closing import Closing
 from enact_dist.access.reads import EachData, Readings, check_requested, slot_of
 from enact_dist.access.session import session_of, unknown_aspect
 from enact_dist.access.together import Together, captured_versions
+from enact_dist.access.watch import Closing
 from enact_dist.core.protocol.datum import Position
 from enact_dist.core.protocol.messages import Survey, Surveyed
 from enact_dist.errors import LeaseLostError, MisuseError, NullDatumError

@@ -28,9 +28,10 @@ shards too.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 from enact_dist.access.reads import slot_of
+from enact_dist.access.sets import Capture, PendingSets, newest_set_ns
 from enact_dist.core.protocol.messages import Survey, Surveyed
 from enact_dist.errors import ProtocolError
 from enact_dist.terms import Entity, View
@@ -39,7 +40,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from enact_dist.access.session import Session
-    from enact_dist.actor.sets import PendingSets
     from enact_dist.core.protocol.datum import Slot
 
 T_co = TypeVar("T_co", covariant=True)
@@ -77,6 +77,11 @@ class Together(Generic[T_co]):
     __slots__ = (
         "by", "least", "least_after_s", "newest_only", "open_max", "requests", "within_s",
     )  # fmt: skip
+    remedy = (
+        "to lock what belongs to a set, make it the trigger of an Actor; to see the newest"
+        " complete set without a lock, world.view(together)"
+    )
+    """What to do in place of passing it as a lock request."""
 
     def __init__(
         self,
@@ -140,8 +145,6 @@ class Together(Generic[T_co]):
         Args:
             names: What each of its data is called.
         """
-        from enact_dist.actor.sets import PendingSets
-
         first = self.requests[0].entity
         assert isinstance(first, Entity)
         return PendingSets(
@@ -162,7 +165,7 @@ class Together(Generic[T_co]):
             for request, stamp_ns in zip(self.requests, members, strict=True)
         }
 
-    def newest(self, versions: Sequence[Sequence[Captured]]) -> tuple[int, ...]:
+    def newest(self, versions: Sequence[Sequence[Capture]]) -> tuple[int, ...]:
         """Return the capture stamp of each datum of the newest set; None if there is none."""
         if not self.within_s and self.least == len(self.requests):
             stamp_ns = newest_set_ns(versions)
@@ -173,19 +176,7 @@ class Together(Generic[T_co]):
         return trigger.members if trigger is not None else ()
 
 
-class Captured(NamedTuple):
-    """One version of a slot: when it was committed and when its datum was captured.
-
-    `captured_ns` is 0 if unknown; `null` versions have no datum.
-    """
-
-    version: int
-    committed_ns: int
-    captured_ns: int
-    null: bool = False
-
-
-def captured_versions(session: Session, requests: Sequence[View[Any]]) -> list[list[Captured]]:
+def captured_versions(session: Session, requests: Sequence[View[Any]]) -> list[list[Capture]]:
     """Return the retained versions of each request's slot, oldest first, the newest included.
 
     Whatever this process has committed is among them; else it is no cut.
@@ -200,7 +191,7 @@ def captured_versions(session: Session, requests: Sequence[View[Any]]) -> list[l
         tuple(dict.fromkeys(slot.aspect for slot in slots)),
         retained=True,
     )
-    found: dict[Slot, list[Captured]] = {slot: [] for slot in slots}
+    found: dict[Slot, list[Capture]] = {slot: [] for slot in slots}
     shards = sorted(session.shards_of(requests))
     for shard in shards:
         session.settle(shard)
@@ -210,14 +201,8 @@ def captured_versions(session: Session, requests: Sequence[View[Any]]) -> list[l
         for state in answer.states:
             if state.slot in found and state.version:
                 found[state.slot].append(
-                    Captured(
+                    Capture(
                         state.version, state.stamp_ns, state.captured_ns, bool(state.null_reason)
                     )
                 )
     return [found[slot] for slot in slots]
-
-
-def newest_set_ns(versions: Sequence[Sequence[Captured]]) -> int:
-    """Return the largest capture stamp that all of them have, 0 if there is none."""
-    stamps = [{one.captured_ns for one in each if one.captured_ns} for each in versions]
-    return max(set.intersection(*stamps), default=0)

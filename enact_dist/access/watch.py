@@ -16,12 +16,12 @@ from __future__ import annotations
 
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections import deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Self, TypeVar
 
 from enact_dist.access.arguments import check_seconds
-from enact_dist.access.closing import Following
 from enact_dist.core.protocol.datum import Position, Slot
 from enact_dist.core.protocol.messages import Notice, Survey, Surveyed
 from enact_dist.core.state.clock import STAMP_NS_MAX, is_kept
@@ -30,6 +30,8 @@ from enact_dist.link.notices import Interest, Skipped
 from enact_dist.terms import Durability, Entities, Entity
 
 if TYPE_CHECKING:
+    from types import TracebackType
+
     from enact_dist.core.protocol.messages import SlotState
     from enact_dist.link.client.locks import CellClient
 
@@ -41,6 +43,45 @@ RESYNC_S: Final = 1.0
 """How long one attempt to list the slots of a shard again may take."""
 VANISHED: Final = (0, 0)
 """Version and stamp of a slot that its shard does not know any more."""
+
+
+T = TypeVar("T")
+
+
+class Closing(ABC):
+    """A context manager that is closed at the end of its block."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """End it; twice is harmless."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+class Following(Closing, Generic[T]):
+    """Also an iterator, of what `next` returns until it is closed."""
+
+    @abstractmethod
+    def next(self, timeout_s: float | None = None) -> T | None:
+        """Return what comes next, or None when nothing does in time or it is closed."""
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> T:
+        found = self.next()
+        if found is None:
+            raise StopIteration
+        return found
 
 
 class _Known(NamedTuple):

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from enact_dist.access.reads import slot_of
+from enact_dist.access.sets import PendingSets
 from enact_dist.actor.actor import (
     Actor,
     Declared,
@@ -19,7 +20,6 @@ from enact_dist.actor.actor import (
     stands_for_trigger,
 )
 from enact_dist.actor.lock import ActorLock, OnceLock
-from enact_dist.actor.sets import PendingSets
 from enact_dist.errors import MisuseError
 from enact_dist.link.client.calls import CALL_S
 from enact_dist.terms import Entities, Entity, View, refuse_duplicates

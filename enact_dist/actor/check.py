@@ -35,15 +35,13 @@ pattern says.
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING
+import inspect
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final, Literal
 
-from enact_dist.actor.drawing.flows import streams, unstamped_sets
-from enact_dist.actor.drawing.uses import ActorDeclaration as ActorDeclaration  # noqa: PLC0414
-from enact_dist.actor.drawing.uses import Finding as Finding  # noqa: PLC0414 - both are found here, too
-from enact_dist.actor.drawing.uses import uses_of
+from enact_dist.actor.running.doing import raised
 from enact_dist.actor.running.load import check_every_s, load_class, read_options
-from enact_dist.actor.running.user_code import raised
+from enact_dist.actor.uses import ActorDeclaration, uses_of
 from enact_dist.config.table import suggestion
 from enact_dist.core.protocol.datum_types import newest, type_conflict
 from enact_dist.core.protocol.messages import AspectEntry
@@ -56,8 +54,34 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
     from enact_dist.actor.actor import Actor
-    from enact_dist.actor.drawing.uses import Use
+    from enact_dist.actor.uses import Use
     from enact_dist.config.types import CellConfig
+
+
+STREAM_S: Final = 0.1
+"""Data that are written this often, or more often, are a stream."""
+
+Level = Literal["error", "warning", "advice"]
+
+
+@dataclass(frozen=True, slots=True)
+class ActorFinding:
+    """One thing that is wrong, or likely so, with the actors of a cell.
+
+    Attributes:
+        level: "error", "warning" or "advice".
+        kind: As in the table of this module.
+        actors: Names of the actors concerned.
+        text: What was found and what to do.
+    """
+
+    level: Level
+    kind: str
+    actors: tuple[str, ...]
+    text: str
+
+    def __str__(self) -> str:
+        return f"{self.level}: {self.kind}: {self.text}"
 
 
 def check_actors(
@@ -66,7 +90,7 @@ def check_actors(
     worlds: Collection[str] = (),
     aspects: Collection[str] = (),
     initial: Collection[str] = (),
-) -> tuple[Finding, ...]:
+) -> tuple[ActorFinding, ...]:
     """Check all declared reads and writes of a cell against each other.
 
     Args:
@@ -87,12 +111,12 @@ def check_actors(
         *_own_triggers(uses),
         *_writers(uses),
         *_unwritten(uses, initial),
-        *unstamped_sets(uses),
+        *_unstamped_sets(uses),
     ]
     return _ordered(findings)
 
 
-def check_cell(config: CellConfig, *, initial: Collection[str] = ()) -> tuple[Finding, ...]:
+def check_cell(config: CellConfig, *, initial: Collection[str] = ()) -> tuple[ActorFinding, ...]:
     """Check all actors that a `cell.toml` configures: that they load, and `check_actors`.
 
     No actor is made; only its module is imported.  An actor without `worlds` in the file has each
@@ -105,7 +129,7 @@ def check_cell(config: CellConfig, *, initial: Collection[str] = ()) -> tuple[Fi
     """
     actors, findings = declarations_of(config)
     findings += check_actors(actors, worlds=config.worlds, initial=initial)
-    findings += streams(
+    findings += _streams(
         list(uses_of(actors)), {one.name for one in config.aspects if one.durability}
     )
     findings += _sets(actors, {entry.name: entry for entry in config.aspect_entries()})
@@ -117,7 +141,7 @@ def check_cell(config: CellConfig, *, initial: Collection[str] = ()) -> tuple[Fi
     for entry in config.aspects if len(actors) == len(config.actors) and actors else ():
         if entry.name not in named:
             findings.append(
-                Finding(
+                ActorFinding(
                     "warning",
                     "unused aspect",
                     (),
@@ -128,9 +152,9 @@ def check_cell(config: CellConfig, *, initial: Collection[str] = ()) -> tuple[Fi
     return _ordered(findings)
 
 
-def declarations_of(config: CellConfig) -> tuple[list[ActorDeclaration], list[Finding]]:
+def declarations_of(config: CellConfig) -> tuple[list[ActorDeclaration], list[ActorFinding]]:
     """Return the actors of a `cell.toml` that load, and what is wrong with those that do not."""
-    findings: list[Finding] = []
+    findings: list[ActorFinding] = []
     actors: list[ActorDeclaration] = []
     for actor in config.actors:
         try:
@@ -147,10 +171,10 @@ def declarations_of(config: CellConfig) -> tuple[list[ActorDeclaration], list[Fi
         except MisuseError as error:
             if type(error) is ConfigError:
                 text = f"actor {actor.name}: {error}"
-                findings.append(Finding("error", "no such actor", (actor.name,), text))
+                findings.append(ActorFinding("error", "no such actor", (actor.name,), text))
                 continue
             text = f"actor {actor.name} ({actor.class_path}): {raised(error.__cause__ or error)}"
-            findings.append(Finding("error", "broken module", (actor.name,), text))
+            findings.append(ActorFinding("error", "broken module", (actor.name,), text))
     return actors, findings
 
 
@@ -168,7 +192,7 @@ def _of_options(actor_class: type[Actor], options: Mapping[str, object]) -> type
 
 def _sets(
     actors: Iterable[ActorDeclaration], configured: Mapping[str, AspectEntry]
-) -> Iterator[Finding]:
+) -> Iterator[ActorFinding]:
     """Find sets of data that have no history, by the word of `cell.toml` or of the actor."""
     for actor in actors:
         together = actor.actor_class.declaration.together
@@ -177,7 +201,7 @@ def _sets(
             entry = AspectEntry(aspect.name, "", "", *said(checked_retention(aspect.retention)))
             entry = with_larger(entry, configured.get(aspect.name, entry))
             if limits_of(entry).versions == 1:
-                yield Finding(
+                yield ActorFinding(
                     "warning",
                     "set not retained",
                     (actor.name,),
@@ -188,18 +212,18 @@ def _sets(
                 )
 
 
-def _ordered(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+def _ordered(findings: Iterable[ActorFinding]) -> tuple[ActorFinding, ...]:
     levels = ("error", "warning", "advice")
     return tuple(sorted(findings, key=lambda finding: levels.index(finding.level)))
 
 
-def _roles(actors: Iterable[ActorDeclaration], worlds: Collection[str]) -> Iterator[Finding]:
+def _roles(actors: Iterable[ActorDeclaration], worlds: Collection[str]) -> Iterator[ActorFinding]:
     for actor in actors:
         roles = actor.actor_class.declaration.roles
         for role in roles:
             world = actor.world_of(role)
             if world is None:
-                yield Finding(
+                yield ActorFinding(
                     "error",
                     "unbound role",
                     (actor.name,),
@@ -207,7 +231,7 @@ def _roles(actors: Iterable[ActorDeclaration], worlds: Collection[str]) -> Itera
                     f" with worlds = {{ {role} = NAME }}, or --world {role}=NAME",
                 )
             elif worlds and world not in worlds:
-                yield Finding(
+                yield ActorFinding(
                     "error",
                     "unknown world",
                     (actor.name,),
@@ -216,7 +240,7 @@ def _roles(actors: Iterable[ActorDeclaration], worlds: Collection[str]) -> Itera
                 )
         for role in actor.worlds or ():
             if role not in roles:
-                yield Finding(
+                yield ActorFinding(
                     "error",
                     "unknown role",
                     (actor.name,),
@@ -224,7 +248,7 @@ def _roles(actors: Iterable[ActorDeclaration], worlds: Collection[str]) -> Itera
                 )
 
 
-def _entities(actors: Iterable[ActorDeclaration]) -> Iterator[Finding]:
+def _entities(actors: Iterable[ActorDeclaration]) -> Iterator[ActorFinding]:
     for actor in actors:
         unsaid = actor.unsaid
         try:
@@ -232,14 +256,14 @@ def _entities(actors: Iterable[ActorDeclaration]) -> Iterator[Finding]:
         except MisuseError as error:
             kind = "entity unsaid" if unsaid else "no such entity"
             text = f"actor {actor.name}: {error}"
-            yield Finding("warning" if unsaid else "error", kind, (actor.name,), text)
+            yield ActorFinding("warning" if unsaid else "error", kind, (actor.name,), text)
 
 
-def _aspects(uses: Iterable[Use], aspects: Collection[str]) -> Iterator[Finding]:
+def _aspects(uses: Iterable[Use], aspects: Collection[str]) -> Iterator[ActorFinding]:
     for use in uses:
         aspect = use.request.aspect.name
         if aspects and aspect not in aspects:
-            yield Finding(
+            yield ActorFinding(
                 "error",
                 "unknown aspect",
                 (use.actor.name,),
@@ -248,7 +272,7 @@ def _aspects(uses: Iterable[Use], aspects: Collection[str]) -> Iterator[Finding]
             )
 
 
-def _types(uses: Sequence[Use]) -> Iterator[Finding]:
+def _types(uses: Sequence[Use]) -> Iterator[ActorFinding]:
     """Yield the uses of an aspect with a type that does not go with the newest one written."""
     from enact_dist.wire.fingerprint import fingerprint
 
@@ -265,7 +289,7 @@ def _types(uses: Sequence[Use]) -> Iterator[Finding]:
     for use, entry in entries:
         other, registered = known[entry.name]
         if use is not other and type_conflict(registered, entry):
-            yield Finding(
+            yield ActorFinding(
                 "error",
                 "two types",
                 (other.actor.name, use.actor.name),
@@ -274,13 +298,13 @@ def _types(uses: Sequence[Use]) -> Iterator[Finding]:
             )
 
 
-def _own_triggers(uses: Sequence[Use]) -> Iterator[Finding]:
+def _own_triggers(uses: Sequence[Use]) -> Iterator[ActorFinding]:
     for use in uses:
         if use.request not in use.actor.actor_class.declaration.triggers:
             continue
         for other in uses:
             if other.actor is use.actor and other.request.access.writes and other.meets(use):
-                yield Finding(
+                yield ActorFinding(
                     "error",
                     "own trigger",
                     (use.actor.name,),
@@ -289,7 +313,7 @@ def _own_triggers(uses: Sequence[Use]) -> Iterator[Finding]:
                 )
 
 
-def _writers(uses: Sequence[Use]) -> Iterator[Finding]:
+def _writers(uses: Sequence[Use]) -> Iterator[ActorFinding]:
     writes = [use for use in uses if use.request.access.writes]
     for index, one in enumerate(writes):
         for other in writes[index + 1 :]:
@@ -297,7 +321,7 @@ def _writers(uses: Sequence[Use]) -> Iterator[Finding]:
                 continue
             if one.unsaid or other.unsaid:  # the slot that it writes is unknown
                 continue
-            yield Finding(
+            yield ActorFinding(
                 "error",
                 "two writers",
                 (one.actor.name, other.actor.name),
@@ -307,7 +331,7 @@ def _writers(uses: Sequence[Use]) -> Iterator[Finding]:
             )
 
 
-def _unwritten(uses: Sequence[Use], initial: Collection[str]) -> Iterator[Finding]:
+def _unwritten(uses: Sequence[Use], initial: Collection[str]) -> Iterator[ActorFinding]:
     writes = [use for use in uses if use.request.access.writes]
     for use in uses:
         request = use.request
@@ -316,10 +340,104 @@ def _unwritten(uses: Sequence[Use], initial: Collection[str]) -> Iterator[Findin
         if any(write.meets(use) for write in writes):
             continue
         triggers = request in use.actor.actor_class.declaration.triggers
-        yield Finding(
+        yield ActorFinding(
             "warning",
             "unwritten trigger" if triggers else "unwritten read",
             (use.actor.name,),
             f"no actor of the cell writes what {use} {'waits for' if triggers else 'reads'};"
             " it stays null unless something outside writes it",
         )
+
+
+# ---------------------------------------------------------------- what flows from actor to actor
+# A source stamps its data with its tick.  Actors that it triggers write with the same stamp, and so
+# do the actors that these trigger.  A declaration does not show how often a triggered actor writes.
+
+
+def _unstamped_sets(uses: Sequence[Use]) -> Iterator[ActorFinding]:
+    """Find data of a `Together` whose writers are known and set no capture stamp."""
+    stamping = _stamping(uses)
+    for use in uses:
+        together = use.actor.actor_class.declaration.together
+        if together is None or use.request not in together.requests:
+            continue
+        writers = _writers_of(use, uses)
+        if not writers or any(writer.actor.name in stamping for writer in writers):
+            continue
+        writer = writers[0]
+        why = (
+            "runs once" if not writer.actor.actor_class.declaration.triggers
+            else "is triggered by data without one"
+        )  # fmt: skip
+        yield ActorFinding(
+            "warning",
+            "set without stamps",
+            (use.actor.name, writer.actor.name),
+            f"{use} waits for data with equal capture stamps, but {writer} writes them without one:"
+            f" {writer.actor.name} {why}, and its module never uses stamp_ns; call"
+            " lock.put(…, stamp_ns=…), or let a source or stamped data trigger it",
+        )
+
+
+def _streams(uses: Sequence[Use], said: Collection[str]) -> Iterator[ActorFinding]:
+    """Find aspects that actors write often and that are durable only by default.
+
+    Args:
+        uses: All requests of the cell.
+        said: Names of the aspects whose durability `cell.toml` sets.
+    """
+    told = {use.request.aspect.name for use in uses if use.request.aspect.durability} | set(said)
+    for use in uses:
+        period_s, aspect = use.actor.period_s, use.request.aspect.name
+        if period_s is None or period_s > STREAM_S:
+            continue
+        if not use.request.access.writes or aspect in told:
+            continue
+        told.add(aspect)
+        yield ActorFinding(
+            "advice",
+            "durable stream",
+            (use.actor.name,),
+            f"{use} may be written {1 / period_s:.3g} times a second, and each write is forced to"
+            " the disk, because no durability is set; if each datum replaces the one before, write"
+            f' [aspects.{aspect}] durability = "volatile" in cell.toml (or in Aspect(…)), else'
+            ' "os" or "durable" to confirm that this is intended',
+        )
+
+
+def _stamping(uses: Sequence[Use]) -> set[str]:
+    """Return the names of the actors whose data bear a capture stamp, or may."""
+    found = {
+        use.actor.name for use in uses if use.actor.period_s is not None or _says_stamps(use.actor)
+    }
+    while True:
+        more = {
+            use.actor.name
+            for use in uses
+            if _triggers(use) and use.actor.name not in found and _is_stamped(use, uses, found)
+        }
+        if not more:
+            return found
+        found |= more
+
+
+def _is_stamped(use: Use, uses: Sequence[Use], stamping: Collection[str]) -> bool:
+    """Whether what triggers through a request has a stamp; of outside writers it may."""
+    writers = _writers_of(use, uses)
+    return not writers or any(writer.actor.name in stamping for writer in writers)
+
+
+def _says_stamps(actor: ActorDeclaration) -> bool:
+    module = inspect.getmodule(actor.actor_class)
+    try:
+        return "stamp_ns" in inspect.getsource(module or actor.actor_class)
+    except (OSError, TypeError):
+        return True  # its source is not here: assume that it does
+
+
+def _triggers(use: Use) -> bool:
+    return use.request in use.actor.actor_class.declaration.triggers
+
+
+def _writers_of(use: Use, uses: Sequence[Use]) -> list[Use]:
+    return [one for one in uses if one.request.access.writes and one.meets(use)]

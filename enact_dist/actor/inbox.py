@@ -1,6 +1,7 @@
 """How changes reach a running actor: one watch per world context.
 
-An actor with one watch follows it by its own thread while it has nothing else to do.  Of several
+An actor with one watch follows it by its own thread while it has nothing else to do: no other
+thread has to be woken first, and what comes during an update waits in the watch's feed.  Of several
 watches each has a thread that only fills the actor's inbox, since a watch blocks.  A watch whose
 shard is away is opened again with growing pauses; its snapshot then repeats what is known, which
 `PendingTriggers` passes over.
@@ -11,30 +12,32 @@ from __future__ import annotations
 import logging
 import random
 import threading
-import time
-from typing import TYPE_CHECKING, Final, Generic, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Generic, Self, TypeVar
 
 from enact_dist.access.session import session_of
-from enact_dist.access.together import Captured, captured_versions
-from enact_dist.actor.report import Repeated
-from enact_dist.actor.sets import PendingSets
-from enact_dist.actor.triggers import BackOff, PendingTriggers, Trigger
+from enact_dist.access.sets import Capture, PendingSets
+from enact_dist.access.together import captured_versions
+from enact_dist.actor.report import ERROR_LENGTH_MAX, Repeated
+from enact_dist.actor.triggers import BackOff, PendingTriggers
 from enact_dist.errors import LinkError
 from enact_dist.link.clock import monotonic_ns
 from enact_dist.patterns import pattern_matches
 
 if TYPE_CHECKING:
-    from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Collection, Hashable, Mapping, Sequence
 
+    from enact_dist.access.sets import IncompleteSet
+    from enact_dist.access.trigger import Trigger
     from enact_dist.access.watch import Change, Watch
     from enact_dist.actor.binding import BoundActor, Watched
-    from enact_dist.actor.sets import IncompleteSet
-    from enact_dist.terms import Entity
+    from enact_dist.terms import Entity, View
 
 log = logging.getLogger("enact.actor")
 
 AT_ONCE_MAX: Final = 1000
-"""Changes that an idle actor notes before it looks for a run again."""
+"""Changes that an actor notes before it looks for a run again."""
+FOLLOW_S: Final = 0.5
+"""How long a thread waits for a change before it looks whether the actor has ended."""
 
 P = TypeVar("P", PendingTriggers, PendingSets)
 
@@ -61,6 +64,10 @@ class _Box(Generic[P]):
         """Return when `take` will have something; None for not before a change."""
         with self._filled:
             return self._pending.due_ns()
+
+    def note(self, index: int, change: Change) -> None:
+        """Take note of a change of the datum of a trigger, by the trigger's index."""
+        raise NotImplementedError
 
     def fail(self, error: Exception) -> None:
         """Make the actor's thread raise the error that ended a watch."""
@@ -90,25 +97,31 @@ class _Box(Generic[P]):
 
 
 class Inbox(_Box[PendingTriggers]):
-    """`PendingTriggers` that the watching threads fill and the actor's thread empties."""
+    """`PendingTriggers` that the watching threads fill and the actor's thread empties.
+
+    Args:
+        per_entity: As for `PendingTriggers`.
+        each: The indices of the triggers that look at a set of data, not at one.
+    """
 
     meanwhile = False
     """Whether it needs changes during an update, and therefore a separate thread."""
 
-    def __init__(self, *, per_entity: bool) -> None:
+    def __init__(self, *, per_entity: bool, each: Collection[int] = ()) -> None:
         super().__init__(PendingTriggers(per_entity=per_entity))
+        self._of_sets = each
 
-    def changed(self, source: int, entity: Entity, state: Hashable, *, missed: int = 0) -> None:
-        """Take note of a change; `missed` states before it were lost on the way."""
+    def note(self, index: int, change: Change) -> None:
+        """Take note of a change; states that were lost before it are counted as skipped."""
+        entity, state = change.entity, (change.version, change.position.stamp_ns)
         with self._filled:
-            self._pending.skipped += missed
-            if self._pending.changed(source, entity, state):
-                self._filled.notify_all()
-
-    def vanished(self, source: int, entity: Entity, state: Hashable, *, in_set: bool) -> None:
-        """Take note that a trigger datum is null."""
-        with self._filled:
-            if self._pending.vanished(source, entity, state, in_set=in_set):
+            if change.null:
+                in_set = index in self._of_sets
+                news = self._pending.vanished(index, entity, state, in_set=in_set)
+            else:
+                self._pending.skipped += change.gap
+                news = self._pending.changed(index, entity, state)
+            if news:
                 self._filled.notify_all()
 
     def used(self, states: Mapping[tuple[int, Entity], Hashable]) -> None:
@@ -119,10 +132,18 @@ class Inbox(_Box[PendingTriggers]):
 
 
 class SetInbox(_Box[PendingSets]):
-    """`PendingSets` that the watching threads fill and the actor's thread empties."""
+    """`PendingSets` that the watching threads fill and the actor's thread empties.
 
-    def __init__(self, sets: PendingSets) -> None:
+    Args:
+        sets: The account of the sets, which is empty.
+        views: The members of the set, as they are bound.
+    """
+
+    meanwhile = False
+
+    def __init__(self, sets: PendingSets, views: tuple[View[Any], ...] = ()) -> None:
         super().__init__(sets)
+        self._views = views
         self._repeated = Repeated()
 
     @property
@@ -130,17 +151,28 @@ class SetInbox(_Box[PendingSets]):
         """The account of the sets, for its counters."""
         return self._pending
 
-    def start(self, versions: Sequence[Sequence[Captured]]) -> None:
-        """Take what there is when the actor starts."""
+    def start(self) -> None:
+        """Take what there is when the actor starts.
+
+        Raises:
+            ShardUnreachableError: A shard does not answer.
+        """
+        versions = captured_versions(session_of(self._views), self._views)
         with self._filled:
             self._pending.start(versions, monotonic_ns())
 
-    def misses(self, member: int, version: int) -> bool:
-        """Whether versions before this one were not seen."""
+    def note(self, index: int, change: Change) -> None:
+        """Take a change of a member; where versions were missed, what is retained of it."""
+        stamp_ns = change.position.stamp_ns
+        versions = [Capture(change.version, stamp_ns, change.captured_ns, change.null)]
         with self._filled:
-            return self._pending.misses(member, version)
+            misses = self._pending.misses(index, change.version)
+        if misses:
+            view = self._views[index]
+            (versions,) = captured_versions(session_of((view,)), (view,))
+        self.captured(index, versions)
 
-    def captured(self, member: int, versions: Sequence[Captured]) -> None:
+    def captured(self, member: int, versions: Sequence[Capture]) -> None:
         """Take versions of one member of the set, oldest first."""
         with self._filled:
             before, unstamped = self._pending.incomplete, self._pending.unstamped_from
@@ -170,6 +202,19 @@ class SetInbox(_Box[PendingSets]):
         """Return the count to report now for sets without the same data, as `Repeated`."""
         return self._repeated.tell((how, incomplete.missing), str(incomplete), monotonic_ns())
 
+    def counts(self) -> dict[str, object]:
+        """Return what `ActorStatistics` shows of the sets."""
+        sets = self._pending
+        return {
+            "incomplete": sets.incomplete,
+            "last_incomplete": str(sets.told[-1])[:ERROR_LENGTH_MAX] if sets.told else "",
+            "late": sets.late,
+            "unstamped": sets.unstamped,
+            "unstamped_from": ", ".join(sets.unstamped_from)[:ERROR_LENGTH_MAX],
+            "partial": sets.partial,
+            "last_partial": sets.last_partial[:ERROR_LENGTH_MAX],
+        }
+
     def tell_left(self) -> None:
         """Tell of the incomplete sets that were only counted so far."""
         with self._filled:
@@ -184,38 +229,87 @@ def _tell(line: str, count: int | None) -> None:
         log.warning("%s%s", line, f" ({count} like it since the last line)" if count else "")
 
 
-def _by_context(watched: Iterable[Watched]) -> dict[str, list[Watched]]:
-    """Return what one watch can follow together, by the name of the world context."""
-    groups: dict[str, list[Watched]] = {}
-    for each in watched:
-        groups.setdefault(each.context.name, []).append(each)
-    return groups
+class _Follower:
+    """One watch of an actor, opened again with growing pauses while its shard is away.
 
+    Args:
+        bound: The actor.
+        watched: What it follows, of one world context.
+        inbox: Where changes go.
+        over: Set when the actor ends.
+    """
 
-def _watch_of(group: Sequence[Watched]) -> Watch:
-    patterns = dict.fromkeys(str(watched.entities) for watched in group)
-    aspects = {aspect.name: aspect for watched in group for aspect in watched.aspects}
-    return group[0].context.watch_all(patterns, aspects.values())
+    def __init__(
+        self,
+        bound: BoundActor,
+        watched: Sequence[Watched],
+        inbox: Inbox | SetInbox,
+        over: threading.Event,
+    ) -> None:
+        self._bound, self._watched, self._inbox, self._over = bound, watched, inbox, over
+        self._watch: Watch | None = None
+        self._again_ns = 0
+        self._refused = 0
 
+    def run(self) -> None:
+        """Follow the watch until the actor ends, in a thread of its own."""
+        try:
+            while not self._over.is_set():
+                self.follow(FOLLOW_S)
+        except Exception as error:  # noqa: BLE001 (raised again in the actor's thread)
+            if not self._over.is_set():
+                self._inbox.fail(error)
+        finally:
+            self.close()
 
-def _broke_s(group: Sequence[Watched], error: Exception, refused: int) -> float:
-    """Say that a watch broke, and return how long to wait before it is opened again."""
-    wait_s = BackOff().wait_s(refused, random.random())  # noqa: S311 (spreads retries)
-    log.warning(
-        "watch of %s in %s broke, again in %.2f s: %s",
-        ", ".join(str(watched.entities) for watched in group),
-        group[0].context.name,
-        wait_s,
-        error,
-    )
-    return wait_s
+    def follow(self, wait_s: float) -> None:
+        """Wait so long for a change, and note all that have arrived by then."""
+        try:
+            watch = self._watch  # `close` is called by another thread, too
+            if watch is None:
+                left_s = (self._again_ns - monotonic_ns()) / 1e9
+                if left_s > 0:
+                    self._over.wait(min(left_s, wait_s))
+                    return
+                watch = self._watch = self._opened()
+            change = watch.next(timeout_s=wait_s)
+            for _ in range(AT_ONCE_MAX):
+                if change is None:
+                    return
+                self._refused = 0
+                self._note(change)
+                change = watch.next_here()
+            if change is not None:
+                self._note(change)
+        except LinkError as error:
+            self.close()
+            pause_s = BackOff().wait_s(self._refused, random.random())  # noqa: S311 (spreads retries)
+            self._refused += 1
+            self._again_ns = monotonic_ns() + round(pause_s * 1e9)
+            log.warning(
+                "watch of %s in %s broke, again in %.2f s: %s",
+                ", ".join(str(watched.entities) for watched in self._watched),
+                self._watched[0].context.name, pause_s, error,
+            )  # fmt: skip
 
+    def close(self) -> None:
+        """Close the watch, which ends a wait for its next change."""
+        watch, self._watch = self._watch, None
+        if watch is not None:
+            watch.close()
 
-def watching(bound: BoundActor, inbox: Inbox | SetInbox) -> Watching | OwnWatch:
-    """Return what follows an actor's triggers: by its own thread where one watch sees them all."""
-    one = len(_by_context(bound.watched())) == 1
-    own = one and not (isinstance(inbox, Inbox) and inbox.meanwhile)
-    return OwnWatch(bound, inbox) if own else Watching(bound, inbox)
+    def _opened(self) -> Watch:
+        patterns = dict.fromkeys(str(watched.entities) for watched in self._watched)
+        aspects = {aspect.name: aspect for watched in self._watched for aspect in watched.aspects}
+        return self._watched[0].context.watch_all(patterns, aspects.values())
+
+    def _note(self, change: Change) -> None:
+        if not self._bound.covers(change.entity):
+            return
+        for watched in self._watched:
+            if pattern_matches(str(watched.entities), change.entity.name):
+                for index in watched.triggers.get(str(change.aspect), ()):
+                    self._inbox.note(index, change)
 
 
 class Watching:
@@ -224,17 +318,26 @@ class Watching:
     Args:
         bound: The actor.
         inbox: Where its changes go.
+        own: Whether the actor's thread itself follows the watch; None: where there is only one.
+
+    Attributes:
+        own: Whether it does.
     """
 
-    def __init__(self, bound: BoundActor, inbox: Inbox | SetInbox) -> None:
-        self._bound = bound
+    def __init__(
+        self, bound: BoundActor, inbox: Inbox | SetInbox, *, own: bool | None = None
+    ) -> None:
         self._inbox = inbox
         self._over = threading.Event()
-        self._guard = threading.Lock()
-        self._open: list[Watch] = []
+        groups: dict[str, list[Watched]] = {}
+        for each in bound.watched():
+            groups.setdefault(each.context.name, []).append(each)
+        self.own = len(groups) == 1 and not inbox.meanwhile if own is None else own
+        self._followers = [_Follower(bound, group, inbox, self._over) for group in groups.values()]
         self._threads = [
-            threading.Thread(target=self._follow, args=(group,), name=f"watch {name}", daemon=True)
-            for name, group in _by_context(bound.watched()).items()
+            threading.Thread(target=follower.run, name=f"watch {name}", daemon=True)
+            for name, follower in zip(groups, self._followers, strict=True)
+            if not self.own
         ]
 
     def __enter__(self) -> Self:
@@ -243,40 +346,11 @@ class Watching:
         return self
 
     def __exit__(self, *_: object) -> None:
-        with self._guard:
-            self._over.set()
-            opened = tuple(self._open)
-        for watch in opened:
-            watch.close()
+        self._over.set()
+        for follower in self._followers:
+            follower.close()
         for thread in self._threads:
             thread.join()
-
-    def _follow(self, group: Sequence[Watched]) -> None:
-        refused = 0
-        while not self._over.is_set():
-            try:
-                for change in self._changes(group):
-                    refused = 0
-                    self._note_in_all(group, change)
-            except LinkError as error:
-                self._over.wait(_broke_s(group, error, refused))
-                refused += 1
-            except Exception as error:  # noqa: BLE001 (raised again in the actor's thread)
-                if not self._over.is_set():
-                    self._inbox.fail(error)
-                return
-
-    def _changes(self, group: Sequence[Watched]) -> Iterator[Change]:
-        with _watch_of(group) as watch:
-            with self._guard:
-                if self._over.is_set():
-                    return
-                self._open.append(watch)
-            try:
-                yield from watch
-            finally:
-                with self._guard:
-                    self._open.remove(watch)
 
     def take(self, wait_s: float) -> Trigger | None:
         """Return the next run that is due, waiting at most `wait_s` for one; else None.
@@ -284,94 +358,13 @@ class Watching:
         Raises:
             Exception: The error that ended a watch.
         """
-        return self._inbox.take(wait_s)
-
-    def _note_in_all(self, group: Sequence[Watched], change: Change) -> None:
-        for watched in group:
-            if pattern_matches(str(watched.entities), change.entity.name):
-                self._note(watched, change)
-
-    def _note(self, watched: Watched, change: Change) -> None:
-        declaration = self._bound.declaration
-        if not self._bound.covers(change.entity):
-            return
-        if isinstance(self._inbox, SetInbox):
-            for index in watched.triggers.get(str(change.aspect), ()):
-                self._note_in_set(self._inbox, index, change)
-            return
-        state = (change.version, change.position.stamp_ns)
-        for index in watched.triggers.get(str(change.aspect), ()):
-            if change.null:
-                in_set = declaration.triggers[index].access.each
-                self._inbox.vanished(index, change.entity, state, in_set=in_set)
-            else:
-                self._inbox.changed(index, change.entity, state, missed=change.gap)
-
-    def _note_in_set(self, inbox: SetInbox, member: int, change: Change) -> None:
-        """Take a change of a set's member; where versions were missed, what is retained of it."""
-        versions = [
-            Captured(change.version, change.position.stamp_ns, change.captured_ns, change.null)
-        ]
-        if inbox.misses(member, change.version):
-            view = self._bound.set_views()[member]
-            versions = captured_versions(session_of((view,)), (view,))[0]
-        inbox.captured(member, versions)
-
-
-class OwnWatch(Watching):
-    """The only watch of an actor, followed by the actor's thread itself while it is idle.
-
-    No other thread has to be woken first.  What comes during an update waits in the watch's feed.
-    """
-
-    def __init__(self, bound: BoundActor, inbox: Inbox | SetInbox) -> None:
-        super().__init__(bound, inbox)
-        self._threads = []
-        (self._group,) = _by_context(bound.watched()).values()
-        self._watch: Watch | None = None
-        self._again_ns = 0
-        self._refused = 0
-
-    def __exit__(self, *_: object) -> None:
-        self._end()
-
-    def _end(self) -> None:
-        watch, self._watch = self._watch, None
-        if watch is not None:
-            watch.close()
-
-    def take(self, wait_s: float) -> Trigger | None:
-        """Return the next run that is due, following the watch for at most `wait_s`; else None."""
+        if not self.own:
+            return self._inbox.take(wait_s)
         until_ns = monotonic_ns() + round(wait_s * 1e9)
         while True:
             due_ns = self._inbox.due_ns()
             wake_ns = until_ns if due_ns is None else min(due_ns, until_ns)
-            self._follow_for(max(0, wake_ns - monotonic_ns()) / 1e9)
+            self._followers[0].follow(max(0, wake_ns - monotonic_ns()) / 1e9)
             trigger = self._inbox.take(0.0)
             if trigger is not None or monotonic_ns() >= until_ns:
                 return trigger
-
-    def _follow_for(self, wait_s: float) -> None:
-        """Wait so long for a change, and note all that have arrived by then."""
-        try:
-            if self._watch is None:
-                left_s = (self._again_ns - monotonic_ns()) / 1e9
-                if left_s > 0:
-                    time.sleep(min(left_s, wait_s))
-                    return
-                self._watch = _watch_of(self._group)
-            change = self._watch.next(timeout_s=wait_s)
-            for _ in range(AT_ONCE_MAX):
-                if change is None:
-                    return
-                self._refused = 0
-                self._note_in_all(self._group, change)
-                change = self._watch.next_here()
-            if change is not None:
-                self._note_in_all(self._group, change)
-        except LinkError as error:
-            self._end()
-            self._again_ns = monotonic_ns() + round(
-                _broke_s(self._group, error, self._refused) * 1e9
-            )
-            self._refused += 1

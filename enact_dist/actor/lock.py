@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import threading
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
-    from enact_dist.access.newer import Newer
+    from enact_dist.access.trigger import Newer
     from enact_dist.actor.outcome import Outcome
     from enact_dist.core.protocol.datum import Datum, Slot
     from enact_dist.core.protocol.messages import Item

@@ -27,10 +27,10 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from enact_dist.access.lock import Lock
-from enact_dist.access.newer import Newer
+from enact_dist.access.trigger import Newer
 from enact_dist.actor.inbox import Inbox
 from enact_dist.actor.outcome import Outcome, Seen, is_new
-from enact_dist.actor.running.user_code import place_of
+from enact_dist.actor.running.doing import place_of
 from enact_dist.actor.triggers import BackOff
 from enact_dist.errors import (
     ChangedError,
@@ -44,8 +44,9 @@ from enact_dist.link.clock import wall_ns
 from enact_dist.terms import Entities, Entity, LockRequestOne, View, Write
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Hashable, Iterator
+    from collections.abc import Callable, Iterator
 
+    from enact_dist.access.watch import Change
     from enact_dist.actor.binding import BoundActor
     from enact_dist.actor.lock import OnceLock
     from enact_dist.actor.running.doing import Doing
@@ -99,15 +100,16 @@ class OnceInbox(Inbox):
         self._newest: dict[Entity, tuple[int, bool]] = {}
         self._running: tuple[Entity, int, Newer] | None = None
 
-    def changed(self, source: int, entity: Entity, state: Hashable, *, missed: int = 0) -> None:
+    def note(self, index: int, change: Change) -> None:
         """Take note of a change, as `Inbox`."""
-        super().changed(source, entity, state, missed=missed)
-        self._note(entity, state, null=False)
-
-    def vanished(self, source: int, entity: Entity, state: Hashable, *, in_set: bool) -> None:
-        """Take note that a trigger datum is null, as `Inbox`."""
-        super().vanished(source, entity, state, in_set=in_set)
-        self._note(entity, state, null=True)
+        super().note(index, change)
+        entity, committed_ns = change.entity, change.position.stamp_ns
+        with self._filled:
+            if committed_ns > self._newest.get(entity, (0, False))[0]:
+                if len(self._newest) >= KNOWN_MAX:
+                    self._newest = {one: at for one, at in self._newest.items() if not at[1]}
+                self._newest[entity] = committed_ns, change.null
+                self._tell()
 
     def begin(self, entity: Entity, committed_ns: int, newer: Newer) -> None:
         """Tell `newer` of what comes, or has come, after a version of `entity`."""
@@ -119,16 +121,6 @@ class OnceInbox(Inbox):
         """Stop notifying the update."""
         with self._filled:
             self._running = None
-
-    def _note(self, entity: Entity, state: Hashable, *, null: bool) -> None:
-        assert isinstance(state, tuple)
-        committed_ns: int = state[1]
-        with self._filled:
-            if committed_ns > self._newest.get(entity, (0, False))[0]:
-                if len(self._newest) >= KNOWN_MAX:
-                    self._newest = {one: at for one, at in self._newest.items() if not at[1]}
-                self._newest[entity] = committed_ns, null
-                self._tell()
 
     def _tell(self) -> None:
         if self._running is None:

@@ -30,7 +30,7 @@ from weakref import WeakKeyDictionary
 import msgpack
 
 from enact_dist.core.shard.inspection import REPORT_BYTES_MAX
-from enact_dist.errors import ProtocolError
+from enact_dist.errors import CommitUnknownError, ProtocolError
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Mapping
@@ -250,29 +250,20 @@ class RateMeter:
 
 
 class ActorRecord:
-    """Collects what `ActorStatistics` shows.  One thread writes it, any may take a snapshot."""
+    """Collects what `ActorStatistics` shows.  One thread writes it, any may take a snapshot.
 
-    __slots__ = (
-        "_failures",
-        "_last_error",
-        "_last_update_ns",
-        "_last_update_unix_ns",
-        "_missed",
-        "_name",
-        "_rate",
-        "_refused",
-        "_unknown",
-        "_updates",
-        "_waits_ns",
-        "skipped",
-        "state",
-    )
+    Attributes:
+        state: As of `ActorStatistics`.
+        skipped: As of `ActorStatistics`.
+    """
 
     def __init__(self, name: str, *, now_ns: int) -> None:
         self._name = name
         self.state = "starting"
         self.skipped = 0
-        self._updates = self._failures = self._refused = self._unknown = self._missed = 0
+        self._counts: dict[str, Any] = dict.fromkeys(
+            ("updates", "failures", "refused", "unknown", "missed"), 0
+        )
         self._last_error = ""
         self._last_update_ns = self._last_update_unix_ns = 0
         self._rate = RateMeter(start_ns=now_ns)
@@ -284,25 +275,25 @@ class ActorRecord:
 
     def updated(self, *, took_ns: int, now_ns: int, wall_ns: int) -> None:
         """Record an update that committed."""
-        self._updates += 1
+        self._counts["updates"] += 1
         self._last_update_ns = took_ns
         self._last_update_unix_ns = wall_ns
         self._rate.count(now_ns)
 
     def failed(self, error: BaseException) -> None:
         """Record an update that ended with an exception of its own."""
-        self._failures += 1
+        self._counts["failures"] += 1
         self._keep(error)
 
-    def refused(self, error: BaseException, *, unknown: bool) -> None:
+    def refused(self, error: BaseException) -> None:
         """Record an attempt that ended outside the actor's code."""
-        self._refused += 1
-        self._unknown += unknown
+        self._counts["refused"] += 1
+        self._counts["unknown"] += isinstance(error, CommitUnknownError)
         self._keep(error)
 
     def missed(self, ticks: int) -> None:
         """Record ticks of a source that did not run, or ran in vain."""
-        self._missed += ticks
+        self._counts["missed"] += ticks
 
     def snapshot(self, now_ns: int) -> ActorStatistics:
         """Return what was recorded so far."""
@@ -310,12 +301,8 @@ class ActorRecord:
         return ActorStatistics(
             name=self._name,
             state=self.state,
-            updates=self._updates,
             skipped=self.skipped,
-            failures=self._failures,
-            refused=self._refused,
-            unknown=self._unknown,
-            missed=self._missed,
+            **self._counts,
             last_error=self._last_error,
             rate_hz=round(self._rate.rate_hz(now_ns), 3),
             last_update_s=self._last_update_ns / 1e9,

@@ -16,33 +16,15 @@ tested without a thread.  Rules that a change must keep:
 from __future__ import annotations
 
 import heapq
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from enact_dist.access.trigger import WHOLE, Trigger
 
 if TYPE_CHECKING:
     from collections.abc import Hashable
 
     from enact_dist.terms import Entity
-
-WHOLE: Final = ""
-"""Key of the one pending run of an actor whose requests do not depend on the triggering entity."""
-
-
-@dataclass(slots=True)
-class Trigger:
-    """One run to do: for which entity, and how often in a row it was refused before.
-
-    `states` are the changes that it stands for: (index of the trigger request, entity) → state.
-    `captured_ns` is the capture stamp of the set that it stands for, 0 if it is none; `members` the
-    stamp of each datum of that set, 0 of one that is missing.
-    """
-
-    key: str
-    entity: Entity
-    refused: int = 0
-    states: dict[tuple[int, str], Hashable] = field(default_factory=dict)
-    captured_ns: int = 0
-    members: tuple[int, ...] = ()
 
 
 class PendingTriggers:

@@ -13,8 +13,7 @@ from collections import deque
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final
 
-from enact_dist.access.closing import Following
-from enact_dist.access.watch import Watch
+from enact_dist.access.watch import Following, Watch
 from enact_dist.compare.diff import DiffKind, Pair, compared, pairs_of, repeated
 from enact_dist.compare.two_worlds import SideView, aspects_of, both_sides, past_ns_of
 from enact_dist.errors import MisuseError

@@ -45,14 +45,12 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Annotated, Final
 
+from enact_dist.config.table import TableKey
 from enact_dist.errors import ConfigError
 from enact_dist.patterns import pattern_matches
 from enact_dist.terms import Entities
-
-if TYPE_CHECKING:
-    from enact_dist.config.table import Table
 
 KINDS: Final = (
     "image",
@@ -68,11 +66,6 @@ KINDS: Final = (
     "json",
 )
 ENCODINGS: Final = ("rgb8", "bgr8", "rgba8", "bgra8", "mono8", "mono16", "16UC1", "32FC1")
-
-SHOWS_KEYS: Final = (
-    "shows", "frame", "parent", "of", "encoding", "voxel_m", "origin_m", "joints", "inverse",
-)  # fmt: skip
-"""Keys of an aspect's table that say what it shows."""
 
 VOXEL_M_MAX: Final = 1000.0
 
@@ -101,12 +94,12 @@ class Shows:
         ConfigError: A kind or encoding is unknown, a pattern or frame is written wrongly.
     """
 
-    kinds: tuple[str, ...] = ()
+    kinds: Annotated[tuple[str, ...], TableKey("shows")] = ()
     frame: Frames = ""
     parent: Frames = ""
     of: str = ""
     encoding: str = ""
-    voxel_m: float = 0.0
+    voxel_m: Annotated[float, TableKey(high=VOXEL_M_MAX)] = 0.0
     origin_m: tuple[float, ...] = (0.0, 0.0, 0.0)
     joints: tuple[str, ...] = ()
     inverse: bool = False
@@ -165,29 +158,3 @@ def _segment(name: str, entity: str) -> str:
 
 GUESSED: Final = Shows()
 """The default for aspects that the configuration does not mention."""
-
-
-def take_shows(table: Table) -> Shows:
-    """Return what the table of an aspect in a `cell.toml` says.
-
-    Raises:
-        ConfigError: It says something that cannot be used; the message names the line.
-    """
-    kinds = table.take_strings("shows")
-    frame, parent = _take_frames(table, "frame"), _take_frames(table, "parent")
-    of, encoding = table.take_str("of", ""), table.take_str("encoding", "")
-    voxel_m = table.take_float("voxel_m", 0.0, low=0.0, high=VOXEL_M_MAX)
-    origin_m = table.take_floats("origin_m", (0.0, 0.0, 0.0))
-    joints, inverse = table.take_strings("joints"), table.take_bool("inverse", default=False)
-    try:
-        return Shows(kinds, frame, parent, of, encoding, voxel_m, origin_m, joints, inverse)
-    except ConfigError as error:
-        key = next((key for key in SHOWS_KEYS if key in table.values), "shows")
-        table.refuse(key, f"in {table.title} {error}")
-
-
-def _take_frames(table: Table, key: str) -> Frames:
-    if not isinstance(table.values.get(key), dict):
-        return table.take_str(key, "")
-    by_pattern = table.take_table(key)
-    return {pattern: by_pattern.take_str(pattern) for pattern in by_pattern.values}

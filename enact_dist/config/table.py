@@ -1,153 +1,34 @@
-"""One table of a configuration file, read key by key with types, lines and suggestions.
+"""Tables of a configuration file, read by the annotations of dataclasses.
 
-Every `take_…` names the key, what was asked and what was found.  `refuse_unknown` comes first:
-a misspelt key must not end as a silent default.
+A field is a key of the table: its type is what TOML has to give, its default what holds where the
+key is missing, and `TableKey` says what a type cannot::
 
-Finds the line on which a key, table or array element of a TOML text stands.
+    drain_s: Annotated[float | None, TableKey(high=3600.0, variable="DRAIN_S")] = None
 
-`tomllib` gives values without positions; an error in a `cell.toml` must name the line.  The
-locator walks a text that `tomllib` has already accepted, so it checks nothing: it only has to
-know where strings, arrays, inline tables and comments begin and end.
+An unknown key is refused first: a misspelt key must not end as a silent default.  Every error names
+the key, what was asked, what was found, and the line.
 """
 
 from __future__ import annotations
 
-import bisect
 import difflib
-import re
+import inspect
+import math
+import types
+import typing
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NoReturn, TypeVar
+from enum import Enum
+from functools import cache
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, NoReturn, TypeVar
 
 from enact_dist.errors import ConfigError
+from enact_dist.terms import checked_name
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
-
-Path = tuple[str | int, ...]
-"""Where a value stands: keys of tables and indices of arrays, from the root."""
-
-_BARE_KEY: Final = re.compile(r"[A-Za-z0-9_-]+")
-_SPACE: Final = re.compile(r"[ \t]*")
-_GAP: Final = re.compile(r"(?:[ \t\r\n]|#[^\n]*)*")
-_PLAIN: Final = re.compile(r"[^,\]}\r\n#]*")
-_STRINGS: Final = (
-    re.compile(r'"""(?:[^\\]|\\.)*?"{3,5}', re.DOTALL),
-    re.compile(r"'''.*?'{3,5}", re.DOTALL),
-    re.compile(r'"(?:[^"\\]|\\.)*"'),
-    re.compile(r"'[^']*'"),
-)
-
-
-class LineLocator:
-    """Lines of all keys, tables and array elements of one valid TOML text."""
-
-    def __init__(self, text: str) -> None:
-        self._text = text
-        self._starts = [0, *(match.end() for match in re.finditer("\n", text))]
-        self._lines: dict[Path, int] = {}
-        self._tables: dict[Path, int] = {}
-        self._walk()
-
-    def line(self, path: Path) -> int:
-        """Return the line of `path`, from 1; that of its nearest parent where it has none."""
-        while path and path not in self._lines:
-            path = path[:-1]
-        return self._lines.get(path, 1)
-
-    def _note(self, path: Path, at: int) -> None:
-        for length in range(1, len(path) + 1):
-            self._lines.setdefault(path[:length], bisect.bisect_right(self._starts, at))
-
-    def _walk(self) -> None:
-        table: Path = ()
-        at = self._skip(_GAP, 0)
-        while at < len(self._text):
-            at, table = self._statement(at, table)
-            at = self._skip(_GAP, at)
-
-    def _statement(self, at: int, table: Path) -> tuple[int, Path]:
-        if self._text[at] != "[":
-            return self._assignment(at, table), table
-        is_array = self._text.startswith("[[", at)
-        path, end = self._key(self._skip(_SPACE, at + (2 if is_array else 1)))
-        path = self._resolved(path)
-        if is_array:
-            index = self._tables[path] = self._tables.get(path, -1) + 1
-            path = (*path, index)
-        self._note(path, at)
-        return self._skip(_SPACE, end) + (2 if is_array else 1), path
-
-    def _resolved(self, path: Path) -> Path:
-        """Insert the current index behind every prefix that is an array of tables."""
-        found: Path = ()
-        for position, part in enumerate(path):
-            found = (*found, part)
-            if found in self._tables and position < len(path) - 1:
-                found = (*found, self._tables[found])
-        return found
-
-    def _assignment(self, at: int, table: Path) -> int:
-        path, end = self._key(at)
-        self._note(table + path, at)
-        return self._value(self._skip(_SPACE, self._skip(_SPACE, end) + 1), table + path)
-
-    def _key(self, at: int) -> tuple[Path, int]:
-        parts: list[str | int] = []
-        while True:
-            at = self._skip(_SPACE, at)
-            bare = _BARE_KEY.match(self._text, at)
-            end = bare.end() if bare else self._string_end(at)
-            parts.append(self._text[at:end] if bare else _unquoted(self._text[at:end]))
-            dot = self._skip(_SPACE, end)
-            if not self._text.startswith(".", dot):
-                return tuple(parts), end
-            at = dot + 1
-
-    def _value(self, at: int, path: Path) -> int:
-        first = self._text[at]
-        if first in "\"'":
-            return self._string_end(at)
-        if first == "[":
-            return self._array(at, path)
-        if first == "{":
-            return self._inline_table(at, path)
-        return self._skip(_PLAIN, at)
-
-    def _array(self, at: int, path: Path) -> int:
-        index, at = 0, self._skip(_GAP, at + 1)
-        while self._text[at] != "]":
-            self._note((*path, index), at)
-            at = self._skip(_GAP, self._value(at, (*path, index)))
-            if self._text[at] == ",":
-                at = self._skip(_GAP, at + 1)
-            index += 1
-        return at + 1
-
-    def _inline_table(self, at: int, path: Path) -> int:
-        at = self._skip(_GAP, at + 1)
-        while self._text[at] != "}":
-            at = self._skip(_GAP, self._assignment(at, path))
-            if self._text[at] == ",":
-                at = self._skip(_GAP, at + 1)
-        return at + 1
-
-    def _string_end(self, at: int) -> int:
-        for pattern in _STRINGS:
-            match = pattern.match(self._text, at)
-            if match:
-                return match.end()
-        raise AssertionError(f"no string at offset {at} of a text that tomllib accepted")
-
-    def _skip(self, pattern: re.Pattern[str], at: int) -> int:
-        match = pattern.match(self._text, at)
-        return match.end() if match else at
-
-
-def _unquoted(key: str) -> str:
-    """Return a quoted key without quotes; escapes are read the way the names here need them."""
-    body = key[1:-1]
-    return body.replace('\\"', '"').replace("\\\\", "\\") if key.startswith('"') else body
-
+    from enact_dist.config.lines import LineLocator, Place
 
 T = TypeVar("T")
 
@@ -161,25 +42,116 @@ _TOML_NAMES: Final = {
 }
 
 
+@dataclass(frozen=True, slots=True)
+class TableKey:
+    """What a field's type does not say of its key.
+
+    Attributes:
+        name: Its name in the file, where that is not the field's.
+        older: An older name of a table; what stands under both names is merged.
+        low: The least number that is allowed.
+        high: The largest number that is allowed.
+        choices: The texts that are allowed; none: any.
+        make: Makes the value of what the file gives; its `ValueError` says what is wrong.
+        table: The class whose fields are the keys, where the field's own type is another.
+        blank: Whether the texts of a table may be empty.
+        example: What to write, for the error about a missing or empty key.
+        variable: The environment variable that overrides the key, without its prefix.
+        title: What the table itself names: the field is that name, not a key.
+        given: The field is no key; its value comes from elsewhere.
+        inline: The fields of this dataclass are keys of the same table.
+    """
+
+    name: str = ""
+    older: str = ""
+    low: float = 0.0
+    high: float = math.inf
+    choices: tuple[str, ...] = ()
+    make: Callable[[Any], object] | None = None
+    table: type | None = None
+    blank: bool = False
+    example: str = ""
+    variable: str = ""
+    title: str = ""
+    given: bool = False
+    inline: bool = False
+
+
+class Field(NamedTuple):
+    """A field of a class that describes a table.
+
+    Attributes:
+        name: Name of the field.
+        kind: Its type, without None.
+        required: Whether it has no default.
+        key: Its key.
+    """
+
+    name: str
+    kind: Any
+    required: bool
+    key: TableKey
+
+    @property
+    def choices(self) -> tuple[str, ...]:
+        """The texts that are allowed; none: any."""
+        is_enum = isinstance(self.kind, type) and issubclass(self.kind, Enum)
+        return tuple(one.value for one in self.kind) if is_enum else self.key.choices
+
+    @property
+    def item(self) -> Any:
+        """The type of each item, of a tuple."""
+        return typing.get_args(self.kind)[0]
+
+
+@cache
+def fields_of(kind: Any) -> tuple[Field, ...]:
+    """Return the fields of a class that describes a table, each with its key."""
+    found = []
+    parameters = inspect.signature(kind).parameters
+    for name, hint in typing.get_type_hints(kind, include_extras=True).items():
+        key, plain = TableKey(), hint
+        if typing.get_origin(hint) is typing.Annotated:
+            plain, key = typing.get_args(hint)
+        if isinstance(plain, types.UnionType) and type(None) in typing.get_args(plain):
+            (plain,) = (one for one in typing.get_args(plain) if one is not type(None))
+        required = parameters[name].default is inspect.Parameter.empty
+        found.append(Field(name, plain, required, key))
+    return tuple(found)
+
+
+def keys_of(kind: type) -> tuple[str, ...]:
+    """Return the names of the keys of a table that a class describes."""
+    keys: list[str] = []
+    for one in fields_of(kind):
+        if one.key.inline:
+            keys += keys_of(one.kind)
+        elif not one.key.given and not one.key.title:
+            keys += [one.key.name or one.name, *filter(None, [one.key.older])]
+    return tuple(keys)
+
+
 def suggestion(found: str, known: Iterable[str]) -> str:
     """Return ``"; did you mean 'x'?"`` when one of `known` is close to `found`, else nothing."""
     close = difflib.get_close_matches(found, list(known), n=1)
     return f"; did you mean {close[0]!r}?" if close else ""
 
 
-def kind_name(value: object) -> str:
-    """Return what TOML calls the type of `value`, with its article."""
-    return _TOML_NAMES.get(type(value), "a date or time")
-
-
 @dataclass(frozen=True, slots=True)
-class Source:
-    """Where a configuration comes from: for messages only."""
+class ConfigSource:
+    """Where a configuration comes from.
+
+    Attributes:
+        path: The file, as messages name it.
+        locator: Finds the line of an error.
+        folder: What relative paths are relative to.
+    """
 
     path: str
     locator: LineLocator
+    folder: Path
 
-    def refuse(self, where: Path, problem: str) -> NoReturn:
+    def refuse(self, where: Place, problem: str) -> NoReturn:
         """Raise `ConfigError` about the value at `where`."""
         line = self.locator.line(where)
         raise ConfigError(f"{self.path}, line {line}: {problem}", path=self.path, line=line)
@@ -189,9 +161,9 @@ class Source:
 class Table:
     """A table of the file: its values, its place and the source they stand in."""
 
-    values: Mapping[str, object]
-    where: Path
-    source: Source
+    values: Mapping[str, Any]
+    where: Place
+    source: ConfigSource
 
     @property
     def title(self) -> str:
@@ -199,13 +171,40 @@ class Table:
         name = ".".join(str(part) for part in self.where if isinstance(part, str))
         return f"[{name}]" if name else "the file"
 
-    def refuse(self, key: str, problem: str) -> NoReturn:
+    def refuse(self, key: str | int, problem: str) -> NoReturn:
         """Raise `ConfigError` about `key` of this table, or about the table where it is absent."""
         where = (*self.where, key) if key in self.values else self.where
         self.source.refuse(where, problem)
 
-    def refuse_unknown(self, *known: str) -> None:
-        """Raise `ConfigError` for the first key that is none of `known`."""
+    def table(self, key: str) -> Table:
+        """Return the table at `key`, an empty one when it is absent."""
+        found = self.values.get(key, {})
+        if not isinstance(found, dict):
+            self._refuse_type(key, "a table", found)
+        return Table(found, (*self.where, key), self.source)
+
+    def tables(self, key: str) -> list[Table]:
+        """Return the tables of the array of tables at `key`."""
+        found = self.values.get(key, [])
+        if not isinstance(found, list):
+            self.refuse(key, f"{key!r} is an array of tables ([[{key}]]), not {_shown(found)}")
+        for index, item in enumerate(found):
+            if not isinstance(item, dict):
+                where = (*self.where, key, index)
+                self.source.refuse(where, f"{key!r} holds tables ([[{key}]]), not {_shown(item)}")
+        return [Table(item, (*self.where, key, at), self.source) for at, item in enumerate(found)]
+
+    def record(self, kind: type[T], **given: object) -> T:
+        """Return the table as an object of a class whose fields are its keys.
+
+        Args:
+            kind: The class.
+            given: Values of fields that are no keys.
+
+        Raises:
+            ConfigError: A key is unknown or missing, or its value cannot be used.
+        """
+        known = keys_of(kind)
         for key in self.values:
             if key not in known:
                 self.refuse(
@@ -213,105 +212,146 @@ class Table:
                     f"unknown key {key!r} in {self.title}{suggestion(key, known)}"
                     f" (known here: {', '.join(sorted(known))})",
                 )
+        return self._made(kind, given)
 
-    def take_str(self, key: str, default: str | None = None) -> str:
-        """Return the non-empty string at `key`; without `default` the key is required."""
-        value = self._take(key, str, default)
-        if not value and value != default:
-            self.refuse(key, f"{key!r} in {self.title} is an empty string")
-        return value
+    def _made(self, kind: type[T], given: Mapping[str, object]) -> T:
+        values = dict(given)
+        described: type = kind
+        for one in fields_of(described):
+            name = one.key.name or one.name
+            if one.key.title:
+                values[one.name] = self._title(one.key.title)
+            elif one.key.inline:
+                values[one.name] = self._made(one.kind, {})
+            elif name in self.values or one.key.older in self.values:
+                values[one.name] = self._value(name, one)
+            elif one.required and one.name not in given:
+                example = f", such as {one.key.example}" if one.key.example else ""
+                self.refuse(name, f"{self.title} needs the key {name!r}{example}")
+        try:
+            return kind(**values)
+        except ConfigError as error:
+            first = next((key for key in keys_of(kind) if key in self.values), "")
+            self.refuse(first, f"in {self.title} {error}")
 
-    def take_float(self, key: str, default: float, *, low: float, high: float) -> float:
-        """Return the number at `key`, `low` <= it <= `high`."""
-        found = self.values.get(key, default)
-        if isinstance(found, bool) or not isinstance(found, int | float):
-            self.refuse(key, f"{key!r} in {self.title} is a number, not {_shown(found)}")
-        if not low <= found <= high:
+    def _title(self, kind: str) -> str:
+        """Return the name that the table's own title gives."""
+        try:
+            return checked_name(kind, self.where[-1], slashes=False)
+        except ValueError as error:
+            self.source.refuse(self.where, str(error))
+
+    def _value(self, name: str, one: Field) -> object:
+        """Return the value at `name` as its field wants it."""
+        found, kind = self.values.get(name), one.kind
+        if typing.get_origin(kind) is tuple and typing.get_args(kind)[-1] is Ellipsis:
+            return self._items(name, one)
+        if one.key.table is not None:
+            is_table = isinstance(found, dict)
+            given = self.table(name).record(one.key.table) if is_table else found
+            return self._ready(name, one, given)
+        if typing.get_origin(kind) is Mapping:
+            return self._mapping(name, one)
+        if isinstance(kind, types.UnionType) and isinstance(found, dict):
+            return self._mapping(name, one)
+        if kind is float or kind is int:
+            return self._number(name, one)
+        if kind is not bool:
+            return self.text(name, one)
+        if not isinstance(found, bool):
+            self._refuse_type(name, "a boolean", found)
+        return found
+
+    def text(self, name: str, one: Field) -> object:
+        """Return what a field makes of the string at `name`."""
+        found = self.values[name]
+        if not isinstance(found, str):
+            self._refuse_type(name, "a string", found)
+        if not found and (one.required or one.key.make or one.choices or one.kind is Path):
+            self._refuse_empty(name, one)
+        if one.choices and found not in one.choices:
             self.refuse(
-                key, f"{key!r} in {self.title} must lie between {low:g} and {high:g}, not {found!r}"
+                name,
+                f"unknown {name} {found!r}{f' in {self.title}' if self.where else ''}"
+                f"{suggestion(found, one.choices)} (known: {', '.join(one.choices)})",
             )
+        if one.kind is Path:
+            return self.source.folder / Path(found).expanduser()
+        return one.kind(found) if one.choices else self._ready(name, one, found)
+
+    def _number(self, name: str, one: Field) -> float:
+        found, low, high = self.values[name], one.key.low, one.key.high
+        if one.kind is int:
+            if type(found) is not int or found < low:
+                least = " above 0" if low else ", 0 or more"
+                self._refuse_type(name, f"a whole number{least}", found)
+            return found
+        if isinstance(found, bool) or not isinstance(found, int | float):
+            self._refuse_type(name, "a number", found)
+        if not low <= found <= high:
+            allowed = f"lie between {low:g} and {high:g}"
+            self.refuse(name, f"{name!r} in {self.title} must {allowed}, not {found!r}")
         return float(found)
 
-    def take_floats(self, key: str, default: tuple[float, ...]) -> tuple[float, ...]:
-        """Return the numbers of the array at `key`."""
-        found = self.values.get(key, list(default))
-        if not isinstance(found, list):
-            self.refuse(key, f"{key!r} in {self.title} is an array of numbers, not {_shown(found)}")
-        for index, item in enumerate(found):
-            if isinstance(item, bool) or not isinstance(item, int | float):
-                where = (*self.where, key, index)
-                self.source.refuse(
-                    where, f"{key!r} in {self.title} is an array of numbers, not {_shown(item)}"
-                )
-        return tuple(map(float, found))
-
-    def take_bool(self, key: str, *, default: bool) -> bool:
-        """Return the truth value at `key`."""
-        return self._take(key, bool, default)
-
-    def take_count(self, key: str) -> int | None:
-        """Return the whole number above zero at `key`, None where it is absent."""
-        found = self.values.get(key)
-        if found is not None and (type(found) is not int or found < 1):
-            self.refuse(
-                key, f"{key!r} in {self.title} is a whole number above 0, not {_shown(found)}"
+    def _items(self, name: str, one: Field) -> tuple[object, ...]:
+        """Return the items of an array; one bare string counts as an array of one."""
+        if one.key.table is not None:
+            return tuple(
+                self._ready(name, one, table.record(one.key.table)) for table in self.tables(name)
             )
-        return found
-
-    def take_strings(self, key: str, default: tuple[str, ...] = ()) -> tuple[str, ...]:
-        """Return the strings at `key`; one bare string counts as a list of one."""
-        found = self.values.get(key, list(default))
-        items = [found] if isinstance(found, str) else found
+        if one.item not in (str, float):
+            names = self.table(name)
+            return tuple(names.table(each).record(one.item) for each in names.values)
+        found, wanted = self.values[name], "strings" if one.item is str else "numbers"
+        items = [found] if isinstance(found, str) and one.item is str else found
         if not isinstance(items, list):
-            self.refuse(key, f"{key!r} in {self.title} is an array of strings, not {_shown(found)}")
+            self._refuse_type(name, f"an array of {wanted}", found)
+        kinds = str if one.item is str else int | float
+        if one.key.example and ("" in items or (one.required and not items)):
+            self._refuse_empty(name, one)
         for index, item in enumerate(items):
-            if not isinstance(item, str) or not item:
-                where = (*self.where, key, index)
-                self.source.refuse(
-                    where, f"{key!r} in {self.title} is an array of strings, not {_shown(item)}"
-                )
-        return tuple(items)
+            if isinstance(item, bool) or not isinstance(item, kinds) or item == "":
+                problem = f"{name!r} in {self.title} is an array of {wanted}, not {_shown(item)}"
+                self.source.refuse((*self.where, name, index), problem)
+        if one.item is float:
+            return tuple(map(float, items))
+        return tuple(
+            self._ready(name, one, item, index if isinstance(found, list) else None)
+            for index, item in enumerate(items)
+        )
 
-    def take_table(self, key: str) -> Table:
-        """Return the table at `key`, an empty one when it is absent."""
-        found = self.values.get(key, {})
-        if not isinstance(found, dict):
-            self.refuse(key, f"{key!r} in {self.title} is a table, not {_shown(found)}")
-        return Table(found, (*self.where, key), self.source)
+    def _mapping(self, name: str, one: Field) -> Mapping[str, object]:
+        table = self.table(name)
+        if typing.get_args(one.kind)[-1] is object:
+            older = self.table(one.key.older)
+            for key in table.values:
+                if key in older.values:
+                    names = f"{name} and in {one.key.older}"
+                    table.refuse(key, f"{key!r} stands in {names} of {self.title}")
+            return MappingProxyType({**older.values, **table.values})
+        text = Field("", str, not one.key.blank, TableKey())
+        return MappingProxyType({key: table.text(key, text) for key in table.values})
 
-    def take_tables(self, key: str) -> Iterator[Table]:
-        """Yield the tables of the array of tables at `key`."""
-        found = self.values.get(key, [])
-        if not isinstance(found, list):
-            self.refuse(key, f"{key!r} is an array of tables ([[{key}]]), not {_shown(found)}")
-        for index, item in enumerate(found):
-            where = (*self.where, key, index)
-            if not isinstance(item, dict):
-                self.source.refuse(where, f"{key!r} holds tables ([[{key}]]), not {_shown(item)}")
-            yield Table(item, where, self.source)
-
-    def named_tables(self) -> Iterator[tuple[str, Table]]:
-        """Yield name and table of each child of a table of tables, in the order of the file."""
-        for name in self.values:
-            yield name, self.take_table(name)
-
-    def checked(self, key: str, make: Callable[[], T]) -> T:
-        """Return `make()`; its `ValueError` becomes a `ConfigError` about `key`."""
+    def _ready(self, name: str, one: Field, found: object, index: int | None = None) -> object:
+        """Return what the key makes of a value that was found."""
+        if one.key.make is None:
+            return found
         try:
-            return make()
+            return one.key.make(found)
         except ValueError as error:
-            self.refuse(key, str(error))
+            where = (*self.where, name) if index is None else (*self.where, name, index)
+            self.source.refuse(where, str(error))
 
-    def _take(self, key: str, kind: type[T], default: T | None) -> T:
-        found = self.values.get(key, default)
-        if found is None:
-            self.refuse(key, f"{self.title} needs the key {key!r}")
-        if not isinstance(found, kind):
-            wanted = _TOML_NAMES[kind]
-            self.refuse(key, f"{key!r} in {self.title} is {wanted}, not {_shown(found)}")
-        return found
+    def _refuse_type(self, name: str, wanted: str, found: object) -> NoReturn:
+        self.refuse(name, f"{name!r} in {self.title} is {wanted}, not {_shown(found)}")
+
+    def _refuse_empty(self, name: str, one: Field) -> NoReturn:
+        example = one.key.example
+        problem = f"empty; write one, such as {example}" if example else "an empty string"
+        self.refuse(name, f"{name!r} in {self.title} is {problem}")
 
 
 def _shown(value: object) -> str:
-    text = repr(value)
-    return f"{kind_name(value)} ({text if len(text) <= 60 else text[:59] + '…'})"
+    """Return the type of a value, as TOML calls it, and the value."""
+    text, kind = repr(value), _TOML_NAMES.get(type(value), "a date or time")
+    return f"{kind} ({text if len(text) <= 60 else text[:59] + '…'})"

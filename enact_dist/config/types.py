@@ -1,6 +1,7 @@
 """What a cell consists of, as frozen values: the result of reading a `cell.toml`.
 
-`enact_dist.config.read` reads them; everything else only looks at them.
+Their fields are the keys of its tables: `enact_dist.config.read` reads them by their annotations,
+and `enact_dist.config.environment` overrides those that name a variable.
 """
 
 from __future__ import annotations
@@ -8,21 +9,22 @@ from __future__ import annotations
 import json
 import re
 import zlib
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final, NamedTuple
 
 from enact_dist.config.shows import GUESSED, Shows
+from enact_dist.config.table import TableKey
 from enact_dist.core.protocol.messages import AspectEntry, Pin, PlacementMap, ShardEntry
 from enact_dist.core.state.retention import said
 from enact_dist.errors import ConfigError
+from enact_dist.retention import AGE_S_MAX, Retention, checked_retention
+from enact_dist.terms import Durability, Entities, Entity, checked_name
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-    from pathlib import Path
-
     from enact_dist.core.shard.state import ShardSettings
-    from enact_dist.retention import Retention
-    from enact_dist.terms import Durability
 
 CARRIERS: Final = ("auto", "zenoh", "socket")
 """How messages may travel between processes; `local()` needs none of them.
@@ -40,6 +42,7 @@ DRAIN_S_MAX: Final = 3600.0
 
 _ENDPOINT: Final = re.compile(r"tcp/(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):(\d{1,5})\Z")
 _ADDRESS: Final = re.compile(r"((\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)?:)?\d{1,5}\Z")
+_DOTTED_NAME: Final = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*\Z")
 _WILDCARDS: Final = ("0.0.0.0", "[::]")  # noqa: S104 - recognised here in order to be refused
 
 
@@ -79,10 +82,27 @@ def is_wildcard(endpoint: str) -> bool:
     return found is not None and found[1] in _WILDCARDS
 
 
+def _entity(name: str) -> str:
+    return Entity(name).name
+
+
+def _pattern(text: str) -> str:
+    return Entities(text).pattern
+
+
+def _dotted_name(key: str, form: str, path: str) -> str:
+    if not _DOTTED_NAME.match(path):
+        raise ValueError(f"{key!r} is written package.module:{form}, not {path!r}")
+    return path
+
+
 TTL_S_DEFAULT: Final = 2.0
 """Session TTL in seconds: a dead holder blocks others that long; shorter needs a quiet network."""
 
 CARRIER_DEFAULT: Final = "auto"
+
+_EXAMPLE: Final = "tcp/127.0.0.1:7447"
+_DRAIN: Final = TableKey(high=DRAIN_S_MAX, variable="DRAIN_S")
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,13 +120,38 @@ class ShardConfig:
             the daemon.
     """
 
-    name: str
-    listen: tuple[str, ...]
-    advertise: tuple[str, ...]
-    folder: Path | None
+    name: Annotated[str, TableKey(title="shard")]
+    listen: Annotated[
+        tuple[str, ...], TableKey(make=checked_endpoint, example=_EXAMPLE, variable="LISTEN")
+    ]
+    advertise: Annotated[
+        tuple[str, ...], TableKey(make=checked_endpoint, example=_EXAMPLE, variable="ADVERTISE")
+    ] = ()
+    folder: Annotated[Path | None, TableKey(variable="FOLDER")] = None
     host: str = ""
-    metrics: tuple[str, int] | None = None
-    drain_s: float | None = None
+    metrics: Annotated[
+        tuple[str, int] | None, TableKey(make=metrics_address, variable="METRICS")
+    ] = None
+    drain_s: Annotated[float | None, _DRAIN] = None
+
+
+class PinTable(NamedTuple):
+    """The keys of a pin."""
+
+    entities: Annotated[str, TableKey(make=_pattern)]
+    shard: str
+
+
+class RetentionTable(NamedTuple):
+    """The keys of a retention that is written as a table."""
+
+    versions: Annotated[int | None, TableKey(low=1)] = None
+    age_s: Annotated[float | None, TableKey(low=0.001, high=AGE_S_MAX)] = None
+    size_bytes: Annotated[int | None, TableKey(low=1)] = None
+
+
+def _retention(found: object) -> Retention | None:
+    return Retention(*found) if isinstance(found, RetentionTable) else checked_retention(found)
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,11 +167,11 @@ class AspectConfig:
         shows: What a recording shows its data as.
     """
 
-    name: str
+    name: Annotated[str, TableKey(title="aspect")]
     durability: Durability | None = None
-    retention: Retention | None = None
-    compare: str = ""
-    shows: Shows = GUESSED
+    retention: Annotated[Retention | None, TableKey(table=RetentionTable, make=_retention)] = None
+    compare: Annotated[str, TableKey(make=partial(_dotted_name, "compare", "NAME"))] = ""
+    shows: Annotated[Shows, TableKey(inline=True)] = GUESSED
 
     def entry(self) -> AspectEntry:
         """Return it as an entry of a catalogue, without a fingerprint: any type may register."""
@@ -153,16 +198,18 @@ class ActorConfig:
             the actor's process.
     """
 
-    name: str
-    class_path: str
-    worlds: Mapping[str, str]
-    options: Mapping[str, object]
-    every_s: float | None = None
-    entity: str = ""
+    name: Annotated[str, TableKey(title="actor")]
+    class_path: Annotated[str, TableKey("class", make=partial(_dotted_name, "class", "Class"))]
+    worlds: Mapping[str, str] = field(default_factory=dict)
+    options: Annotated[Mapping[str, object], TableKey("args", older="options")] = field(
+        default_factory=dict
+    )
+    every_s: Annotated[float | None, TableKey(low=0.001, high=86_400.0)] = None
+    entity: Annotated[str, TableKey(make=_entity)] = ""
     host: str = ""
-    drain_s: float | None = None
-    env: Mapping[str, str] = field(default_factory=dict)
-    process: str = ""
+    drain_s: Annotated[float | None, _DRAIN] = None
+    env: Annotated[Mapping[str, str], TableKey(blank=True)] = field(default_factory=dict)
+    process: Annotated[str, TableKey(make=partial(checked_name, "process", slashes=False))] = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,15 +258,19 @@ class CellConfig:
         actors: Actors of the cell, in the order of the file.
     """
 
-    path: Path
-    name: str
-    ttl_s: float
-    carrier: str
-    shared_bytes_max: int | None
-    data_folder: Path | None
-    worlds: tuple[str, ...]
-    shards: tuple[ShardConfig, ...]
-    pins: tuple[Pin, ...] = ()
+    path: Annotated[Path, TableKey(given=True)]
+    name: Annotated[str, TableKey(make=partial(checked_name, "cell", slashes=False))]
+    ttl_s: Annotated[
+        float, TableKey("session_ttl_s", low=TTL_S_MIN, high=TTL_S_MAX, variable="SESSION_TTL_S")
+    ] = TTL_S_DEFAULT
+    carrier: Annotated[str, TableKey(choices=CARRIERS, variable="CARRIER")] = CARRIER_DEFAULT
+    shared_bytes_max: Annotated[int | None, TableKey(variable="SHARED_BYTES_MAX")] = None
+    data_folder: Annotated[Path | None, TableKey(variable="DATA_FOLDER")] = None
+    worlds: Annotated[
+        tuple[str, ...], TableKey(make=partial(checked_name, "world context", slashes=False))
+    ] = ()
+    shards: tuple[ShardConfig, ...] = ()
+    pins: Annotated[tuple[Pin, ...], TableKey(table=PinTable, make=Pin._make)] = ()
     aspects: tuple[AspectConfig, ...] = ()
     actors: tuple[ActorConfig, ...] = ()
 

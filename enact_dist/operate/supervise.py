@@ -83,7 +83,7 @@ class _Ready:
     child: _Child
 
 
-class Pauses:
+class RestartPauses:
     """How long what ends waits for its next start: doubled each time, short after a good while."""
 
     __slots__ = ("_next_s", "_started_s")
@@ -119,7 +119,7 @@ class _Child:
         self.pause_s = 0.0
         self._say, self._events = say, events
         self._process: subprocess.Popen[bytes] | None = None
-        self._pauses = Pauses()
+        self._pauses = RestartPauses()
 
     @property
     def running(self) -> bool:

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 from enact_dist.access.arguments import check_reason
 from enact_dist.access.asking import ask_all, await_stamp
-from enact_dist.access.closing import Closing
 from enact_dist.access.lock import refuse_inside_lock
 from enact_dist.access.session import Session
+from enact_dist.access.watch import Closing
 from enact_dist.core.protocol.datum import Position
 from enact_dist.core.protocol.messages import (
     Audited,

@@ -21,7 +21,7 @@ from enact_dist.world.cell import Cell
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from enact_dist.config.read import CellConfig
+    from enact_dist.config.types import CellConfig
     from enact_dist.link.clock import Clock
 
 TTL_S: Final = 2.0

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from enact_dist.actor.actor import Actor
-from enact_dist.actor.check import ActorDeclaration, Finding, check_actors, check_cell
+from enact_dist.actor.check import ActorFinding, check_actors, check_cell
+from enact_dist.actor.uses import ActorDeclaration
 from enact_dist.config.read import load_config
 from enact_dist.terms import Aspect, Entities, Entity, View, ViewEach, World, Write, WriteEach
 
@@ -61,7 +62,7 @@ class PoliteAlarm(Alarm):
 BOUND = {"online": "online"}
 
 
-def check(*classes: type[Actor], **options: object) -> tuple[Finding, ...]:
+def check(*classes: type[Actor], **options: object) -> tuple[ActorFinding, ...]:
     """Check a cell of these actors, each named after its class and bound to `online`."""
     actors = [
         ActorDeclaration(f"{actor_class.__name__.lower()}{index}", actor_class, BOUND)
@@ -70,7 +71,7 @@ def check(*classes: type[Actor], **options: object) -> tuple[Finding, ...]:
     return check_actors(actors, **options)
 
 
-def only(findings: tuple[Finding, ...]) -> Finding:
+def only(findings: tuple[ActorFinding, ...]) -> ActorFinding:
     """Return the one finding."""
     assert len(findings) == 1, findings
     return findings[0]

@@ -6,7 +6,8 @@ import pytest
 
 from enact_dist.access.together import Together
 from enact_dist.actor.actor import Actor
-from enact_dist.actor.check import ActorDeclaration, check_actors, check_cell
+from enact_dist.actor.check import check_actors, check_cell
+from enact_dist.actor.uses import ActorDeclaration
 from enact_dist.config.read import load_config
 from enact_dist.terms import Aspect, Entities, Entity, View, World, Write, WriteEach
 

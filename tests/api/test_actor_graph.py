@@ -8,10 +8,9 @@ from xml.etree import ElementTree as ET
 import pytest
 
 from enact_dist.actor.actor import Actor
-from enact_dist.actor.check import ActorDeclaration, declarations_of
-from enact_dist.actor.drawing.graph import graph_of, laid_out
-from enact_dist.actor.drawing.svg import svg_of
-from enact_dist.actor.drawing.uses import uses_of
+from enact_dist.actor.check import declarations_of
+from enact_dist.actor.graph import graph_of, laid_out, svg_of
+from enact_dist.actor.uses import ActorDeclaration, uses_of
 from enact_dist.cli.main import main
 from enact_dist.config.read import load_config
 from enact_dist.terms import Aspect, Entities, Entity, Read, View, ViewEach, World, Write

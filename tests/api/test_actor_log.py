@@ -6,13 +6,12 @@ import threading
 
 import pytest
 
-from enact_dist.access.together import Captured
+from enact_dist.access.sets import Capture, PendingSets
 from enact_dist.actor import report
 from enact_dist.actor.actor import Actor
 from enact_dist.actor.inbox import SetInbox
 from enact_dist.actor.report import KINDS_MAX, PAUSE_NS_MAX, PAUSE_NS_MIN, Repeated, kind_of
 from enact_dist.actor.running.runner import run_actor
-from enact_dist.actor.sets import PendingSets
 from enact_dist.errors import SHARD_RESTARTED, LeaseLostError
 from enact_dist.terms import Aspect, Entity, World, Write
 from enact_dist.world.connecting import local
@@ -114,10 +113,10 @@ def test_dead_camera_is_one_line_and_a_count(caplog):
     inbox = SetInbox(sets)
     with caplog.at_level(logging.WARNING, "enact.actor"):
         for stamp_ns in range(1, 21):
-            inbox.captured(0, [Captured(stamp_ns, stamp_ns, stamp_ns, null=False)])
-            inbox.captured(1, [Captured(stamp_ns, stamp_ns, stamp_ns, null=False)])
-        inbox.captured(0, [Captured(21, 21, 21, null=False)])
-        inbox.captured(0, [Captured(22, 22, 22, null=False)])
+            inbox.captured(0, [Capture(stamp_ns, stamp_ns, stamp_ns, null=False)])
+            inbox.captured(1, [Capture(stamp_ns, stamp_ns, stamp_ns, null=False)])
+        inbox.captured(0, [Capture(21, 21, 21, null=False)])
+        inbox.captured(0, [Capture(22, 22, 22, null=False)])
         inbox.tell_left()
 
     assert sets.incomplete == 21

@@ -17,7 +17,7 @@ from enact_dist.actor.report import (
     percentile,
 )
 from enact_dist.core.shard.inspection import REPORT_BYTES_MAX
-from enact_dist.errors import ProtocolError
+from enact_dist.errors import CommitUnknownError, ProtocolError
 
 SECOND_NS = 1_000_000_000
 
@@ -93,8 +93,8 @@ def test_record_counts_each_ending_of_an_update_apart():
     record = ActorRecord("fusion", now_ns=0)
     record.waited(2_000_000)
     record.updated(took_ns=30_000_000, now_ns=SECOND_NS, wall_ns=5 * SECOND_NS)
-    record.refused(TimeoutError("held by perception"), unknown=False)
-    record.refused(ConnectionError("no answer"), unknown=True)
+    record.refused(TimeoutError("held by perception"))
+    record.refused(CommitUnknownError("no answer"))
     record.failed(ValueError("empty cloud"))
 
     found = record.snapshot(SECOND_NS)

@@ -13,7 +13,7 @@ from enact_dist.access.lock import Lock
 from enact_dist.actor import binding as actor_binding
 from enact_dist.actor.actor import Actor
 from enact_dist.actor.binding import BoundActor
-from enact_dist.actor.inbox import Inbox, OwnWatch, Watching, watching
+from enact_dist.actor.inbox import Inbox, Watching
 from enact_dist.actor.report import decode_reports
 from enact_dist.actor.running.process import ActorThread, actor_command
 from enact_dist.actor.running.runner import run_actor
@@ -273,8 +273,8 @@ class FlakyContext:
         return self.context.watch_all(*args)
 
 
-@pytest.mark.parametrize("kind", [Watching, OwnWatch])
-def test_watching_opens_a_watch_again_when_its_shard_was_away(cell, caplog, kind):
+@pytest.mark.parametrize("own", [False, True])
+def test_watching_opens_a_watch_again_when_its_shard_was_away(cell, caplog, own):
     """No change is lost: the watch that opens at last begins with what is there."""
     caplog.set_level(logging.CRITICAL, logger="enact.actor")
     write(cell, A, 1)
@@ -282,7 +282,7 @@ def test_watching_opens_a_watch_again_when_its_shard_was_away(cell, caplog, kind
     bound.contexts["online"] = FlakyContext(cell.world("online"), failures=2)
     inbox = Inbox(per_entity=True)
 
-    with kind(bound, inbox) as changes:
+    with Watching(bound, inbox, own=own) as changes:
         trigger = changes.take(PATIENCE_S)
 
     assert trigger is not None
@@ -293,14 +293,14 @@ def test_watch_of_an_actor_that_breaks_is_opened_again_without_a_loss(cell, capl
     """What changed meanwhile is found at the new beginning, what was seen runs no second time."""
     caplog.set_level(logging.CRITICAL, logger="enact.actor")
     bound = BoundActor(Reconstruction(), cell)
-    with OwnWatch(bound, Inbox(per_entity=True)) as changes:
+    with Watching(bound, Inbox(per_entity=True)) as changes:
         write(cell, A, 1)
         assert changes.take(PATIENCE_S).entity == A
 
         def away(**_):
             raise ShardUnreachableError("shard left did not answer")
 
-        monkeypatch.setattr(changes._watch, "next", away)
+        monkeypatch.setattr(changes._followers[0]._watch, "next", away)
         assert changes.take(0.0) is None
         write(cell, B, 2)
 
@@ -312,7 +312,7 @@ def test_actor_of_one_world_follows_it_by_its_own_thread(cell):
     """Nobody is woken to wake somebody else; two world contexts are two watches."""
     bound = BoundActor(Reconstruction(), cell)
 
-    assert type(watching(bound, Inbox(per_entity=True))) is OwnWatch
+    assert Watching(bound, Inbox(per_entity=True)).own
 
 
 def test_requests_are_bound_once_per_entity_and_not_kept_without_end(cell, monkeypatch):

@@ -8,8 +8,7 @@ from collections import Counter
 import pytest
 
 from enact_dist import Entity
-from enact_dist.access.together import Captured
-from enact_dist.actor.sets import PendingSets
+from enact_dist.access.sets import Capture, PendingSets
 
 NAMES = ("left", "middle", "right")
 LEFT, MIDDLE, RIGHT = range(3)
@@ -26,7 +25,7 @@ class Feed:
     def next(self, member, stamp_ns, *, null=False):
         self.commits += 1
         self.versions[member] += 1
-        return Captured(self.versions[member], self.commits, stamp_ns, null)
+        return Capture(self.versions[member], self.commits, stamp_ns, null)
 
     def come(self, stamp_ns, *members, now_ns=0):
         for member in members or range(len(NAMES)):

@@ -295,7 +295,7 @@ WRONG = {
     "pin key": ('name = "c"\n' + SHARD + '[[pins]]\nentity = "a"\n', 5, "unknown key 'entity' in [pins]; did you mean 'entities'?"),
     "pins type": ('name = "c"\n' + SHARD + '[pins]\nshard = "left"\n', 4, "'pins' is an array of tables ([[pins]]), not a table"),
     "pin type": ('name = "c"\npins = [\n1]\n' + SHARD, 3, "'pins' holds tables ([[pins]]), not an integer (1)"),
-    "durability": ('name = "c"\n' + SHARD + '[aspects.x]\ndurability = "volatil"\n', 5, "unknown durability 'volatil' of aspect 'x'; did you mean 'volatile'?"),
+    "durability": ('name = "c"\n' + SHARD + '[aspects.x]\ndurability = "volatil"\n', 5, "unknown durability 'volatil' in [aspects.x]; did you mean 'volatile'?"),
     "retention": ('name = "c"\n' + SHARD + "[aspects.x]\nretention = 0\n", 5, "versions of a retention is a number from 1 to 100000, not 0"),
     "retention kind": ('name = "c"\n' + SHARD + "[aspects.x]\nretention = true\n", 5, "a retention is a number of versions or Retention(versions, age_s, size_bytes), not True"),
     "retention key": ('name = "c"\n' + SHARD + "[aspects.x]\nretention = { version = 3 }\n", 5, "unknown key 'version' in [aspects.x.retention]; did you mean 'versions'?"),

@@ -2,7 +2,7 @@
 
 import tomllib
 
-from enact_dist.config.table import LineLocator
+from enact_dist.config.lines import LineLocator
 
 TEXT = '''\
 # comment = 1

@@ -17,8 +17,9 @@ from enact_dist import (
     testing,
 )
 from enact_dist.actor.binding import BoundActor
-from enact_dist.actor.check import ActorDeclaration, check_actors
+from enact_dist.actor.check import check_actors
 from enact_dist.actor.running.process import ActorThread, actor_command
+from enact_dist.actor.uses import ActorDeclaration
 from enact_dist.errors import MisuseError
 
 CAMERAS = Entities("camera/*")

@@ -39,7 +39,7 @@ from enact_dist.access.watch import Change
 from enact_dist.actor.actor import Actor
 from enact_dist.actor.binding import BoundActor
 from enact_dist.actor.check import check_cell
-from enact_dist.actor.inbox import SetInbox, Watching
+from enact_dist.actor.inbox import SetInbox
 from enact_dist.actor.running.process import ActorThread
 from enact_dist.config.read import load_config
 from enact_dist.core.protocol.datum import Position
@@ -293,19 +293,18 @@ def test_set_that_left_retention_before_its_update_is_counted_with_what_is_missi
 def test_versions_whose_notices_were_lost_are_asked_for(cell):
     """A gap in the notices costs no set, as far as versions are retained."""
     bound = BoundActor(Sum(), cell)
-    inbox = SetInbox(bound.pending_sets())
+    inbox = SetInbox(bound.pending_sets(), bound.set_views())
     for stamp_ns in (1, 2, 3):
         capture(cell, LEFT, stamp_ns)
         capture(cell, RIGHT, stamp_ns)
     newest = [each[-1] for each in captured_versions(
         cell.world("online").session, bound.set_views()
     )]  # fmt: skip
-    watching = Watching(bound, inbox)
 
-    for watched, entity, one in zip(bound.watched(), (LEFT, RIGHT), newest, strict=True):
+    for index, (entity, one) in enumerate(zip((LEFT, RIGHT), newest, strict=True)):
         position = Position(one.committed_ns, "s0")
         change = Change(entity, "depth", one.version, position, 2, False, one.captured_ns)
-        watching._note(watched, change)
+        inbox.note(index, change)
 
     runs = [inbox.take(0.0) for _ in range(4)]
     assert [run and run.captured_ns for run in runs] == [1, 2, 3, None]

@@ -20,24 +20,118 @@ from __future__ import annotations
 
 import logging
 import os
+import sys
 import threading
+import time
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.actor.running.drain import CUT_OFF, Drain
-from enact_dist.actor.running.stop import LOOK_S, StopWithPulse
-from enact_dist.operate.supervise import NEVER_AGAIN, Pauses
+from enact_dist.operate.supervise import NEVER_AGAIN, RestartPauses
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from enact_dist.actor.running.doing import Doing
 
+LOOK_S: Final = 0.1
+"""How often a wait looks."""
+DRAIN_S: Final = 8.0
+"""How long an update may still take after the first signal; `docker stop` kills after 10 s."""
+SAY_S: Final = 1.5
+"""How long writing the last line may block if the log has no reader."""
+CUT_OFF: Final = 1
+"""Exit status of a process that has cut something off."""
 DONE: Final = 0
 ANEW: Final = 75
 """Exit status of an actor that ends in order to restart: its supervisor starts it again."""
 
 log = logging.getLogger("enact.actor")
+
+
+class StopWithPulse(threading.Event):
+    """The stop of an actor as its pulse: each look calls `alive`, in the thread that looks.
+
+    An actor that is idle, waits for a lock or was refused looks every 0.1 s.  One inside `update`
+    does not look: an update that hangs, or takes longer than the watchdog allows, is silent.
+
+    Args:
+        alive: Called with each sign of life; must not block.
+    """
+
+    def __init__(self, alive: Callable[[], None]) -> None:
+        super().__init__()
+        self._alive = alive
+
+    def is_set(self) -> bool:
+        """Return whether to stop."""
+        self._alive()
+        return super().is_set()
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Wait until it is set, or for `timeout` seconds; return whether to stop."""
+        end_s = float("inf") if timeout is None else time.monotonic() + timeout
+        while True:
+            self._alive()
+            left_s = end_s - time.monotonic()
+            if super().wait(max(0.0, min(left_s, LOOK_S))) or left_s <= LOOK_S:
+                return super().is_set()
+
+
+class ActorDrain:
+    """The end of an actor: its current update may finish and commit within `drain_s`.
+
+    If the update does not return by then, or at a second signal, the drain logs what it was doing
+    and ends the process; its lock ends with it.
+
+    Args:
+        name: Name of the actor.
+        doing: What the actor does.
+        drain_s: How long it may still take.
+        leave: Ends the process with a status, without waiting for any thread.
+    """
+
+    def __init__(
+        self, name: str, doing: Doing, drain_s: float, leave: Callable[[int], object] = os._exit
+    ) -> None:
+        self._name, self._doing, self._drain_s, self._leave = name, doing, drain_s, leave
+        self._over = threading.Event()
+
+    def begin(self, signal: str) -> None:
+        """Begin the drain at the first signal."""
+        if self._doing.call is not None:
+            log.info(
+                "%s received: actor %s finishes its current call and ends, within %g s; a second"
+                " signal ends it at once",
+                signal, self._name, self._drain_s,
+            )  # fmt: skip
+        why = f"did not end within {self._drain_s:g} s of {signal}"
+        threading.Thread(target=self._wait, args=(why,), name="drain", daemon=True).start()
+
+    def hurry(self, _signal: str) -> None:
+        """End the process at once at the second request to end."""
+        self._cut_off("received a second signal")
+
+    def over(self) -> None:
+        """Note that the actor has ended by itself."""
+        self._over.set()
+
+    def _wait(self, why: str) -> None:
+        if not self._over.wait(self._drain_s):
+            self._cut_off(why)
+
+    def _cut_off(self, why: str) -> None:
+        if self._over.is_set():
+            return
+        say = threading.Thread(target=self._say, args=(why,), daemon=True)
+        say.start()
+        say.join(SAY_S)
+        self._over.set()  # set once, if leaving waits for other actors of the process
+        self._leave(CUT_OFF)
+
+    def _say(self, why: str) -> None:
+        log.critical("cut off: actor %s %s: %s", self._name, why, self._doing.cut_off())
+        sys.stdout.flush()
+        sys.stderr.flush()
 
 
 class Life:
@@ -68,12 +162,12 @@ class Life:
         self.ready = ready
         self._name, self._drain_s, self._leave = name, drain_s, leave
         self._mutex = threading.Lock()
-        self._drain: Drain | None = None
+        self._drain: ActorDrain | None = None
         self._why = ""
 
     def begin(self, doing: Doing) -> None:
         """Note that the actor is about to run; `doing` tells what it does."""
-        drain = Drain(self._name, doing, self._drain_s, self._leave)
+        drain = ActorDrain(self._name, doing, self._drain_s, self._leave)
         with self._mutex:
             self._drain, why = drain, self._why
         if why:
@@ -170,7 +264,7 @@ class ActorGroup:
 
     def _keep(self, name: str) -> None:
         """Run an actor, and run it again, in its thread."""
-        pauses = Pauses()
+        pauses = RestartPauses()
         try:
             while (life := self._begun(name)) is not None:
                 pauses.started()
@@ -206,7 +300,7 @@ class ActorGroup:
             self._serving.discard(name)
         self._heard_of(name)
 
-    def _again(self, name: str, status: int, pauses: Pauses) -> bool:
+    def _again(self, name: str, status: int, pauses: RestartPauses) -> bool:
         """Tell of the end of an actor; wait and return True where it is to be started again."""
         if status == DONE:
             log.info("actor %s is done; it is not started again", name)

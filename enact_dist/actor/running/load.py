@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.actor.actor import Actor, check_period, check_update
 from enact_dist.actor.report import ARGS_MAX
-from enact_dist.actor.running.user_code import own_lines, place_of
+from enact_dist.actor.running.doing import own_lines, place_of
 from enact_dist.config.table import suggestion
 from enact_dist.errors import ConfigError, EnactError, MisuseError
 from enact_dist.terms import Entity

@@ -30,13 +30,11 @@ import math
 import random
 import threading
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from enact_dist.access.session import session_of
-from enact_dist.access.together import captured_versions
 from enact_dist.actor.actor import Actor, check_period, name_of
 from enact_dist.actor.binding import BoundActor
-from enact_dist.actor.inbox import Inbox, SetInbox, watching
+from enact_dist.actor.inbox import Inbox, SetInbox, Watching
 from enact_dist.actor.once import REFUSALS, Once, OnceInbox, TakenError
 from enact_dist.actor.report import (
     ERROR_LENGTH_MAX,
@@ -51,7 +49,6 @@ from enact_dist.actor.running.doing import Doing
 from enact_dist.actor.running.load import shown_values
 from enact_dist.actor.triggers import BackOff, FixedRate
 from enact_dist.errors import (
-    CommitUnknownError,
     LeaseLostError,
     LinkError,
     LockTimeoutError,
@@ -145,10 +142,13 @@ class ActorRun:
         self._wait_s = wait_s
         self._on_error = on_error
         sets = self._bound.pending_sets()
-        self._sets = SetInbox(sets) if sets is not None else None
-        per_entity = self._bound.declaration.per_entity
+        views = self._bound.set_views()
+        self._sets = SetInbox(sets, views) if sets is not None else None
+        declaration = self._bound.declaration
+        per_entity = declaration.per_entity
+        each = [at for at, one in enumerate(declaration.triggers) if one.access.each]
         self._once: Once | None = None
-        self._inbox = Inbox(per_entity=per_entity)
+        self._inbox = Inbox(per_entity=per_entity, each=each)
         self._back_off = BackOff()
         self._failures = Repeated()
         self.name = name or name_of(actor)
@@ -156,7 +156,7 @@ class ActorRun:
         self._board = ReportBoard.of(cell)
         self._ended = threading.Event()
         self.doing = Doing(type(actor).__name__)
-        if self._bound.declaration.outcome is not None:
+        if declaration.outcome is not None:
             self._inbox = inbox = OnceInbox(per_entity=per_entity)
             self._once = Once(self._bound, self.name, self.doing, stop=stop, inbox=inbox)
         self._lost: set[Entity | None] = set()
@@ -166,44 +166,29 @@ class ActorRun:
         self._reported_ns = 0
         if self._every_s is not None:
             check_period(self.name, self._every_s)
-            if self._bound.declaration.triggers:
+            if declaration.triggers:
                 raise MisuseError(f"{self.name} has triggers and every_s; it can have only one")
 
     def statistics(self) -> ActorStatistics:
         """Return what the actor has done so far."""
-        self._record.skipped = self._inbox.skipped
-        statistics = dataclasses.replace(
-            self._record.snapshot(monotonic_ns()),
-            writes=self._bound.writes()[:WRITES_MAX],
-            args=shown_values(self._actor),
-            words_in=self.words_in if self._listens else "",
-            word=self._word,
-        )
+        inbox = self._sets or self._inbox
+        self._record.skipped = inbox.skipped
+        more: dict[str, Any] = {
+            "writes": self._bound.writes()[:WRITES_MAX],
+            "args": shown_values(self._actor),
+            "words_in": self.words_in if self._listens else "",
+            "word": self._word,
+        }
         if (call := self.doing.call) is not None and call.method == "update":
             lasted_s, lost = (monotonic_ns() - call.since_ns) / 1e9, call.lock_lost
-            state = "stuck" if lost else statistics.state
-            statistics = dataclasses.replace(
-                statistics, state=state, updating_s=round(lasted_s, 3), lock_lost=lost
-            )
+            more |= {"updating_s": round(lasted_s, 3), "lock_lost": lost}
+            more |= {"state": "stuck"} if lost else {}
         if self._once is not None:
             interrupted, last = self._once.interrupted, self._once.last_interrupted
-            return dataclasses.replace(
-                statistics, interrupted=interrupted, last_interrupted=last[:ERROR_LENGTH_MAX]
-            )
-        if self._sets is None:
-            return statistics
-        sets = self._sets.sets
-        return dataclasses.replace(
-            statistics,
-            skipped=sets.skipped,
-            incomplete=sets.incomplete,
-            last_incomplete=str(sets.told[-1])[:ERROR_LENGTH_MAX] if sets.told else "",
-            late=sets.late,
-            unstamped=sets.unstamped,
-            unstamped_from=", ".join(sets.unstamped_from)[:ERROR_LENGTH_MAX],
-            partial=sets.partial,
-            last_partial=sets.last_partial[:ERROR_LENGTH_MAX],
-        )
+            more |= {"interrupted": interrupted, "last_interrupted": last[:ERROR_LENGTH_MAX]}
+        elif self._sets is not None:
+            more |= self._sets.counts()
+        return dataclasses.replace(self._record.snapshot(monotonic_ns()), **more)
 
     def answer(self, word: str = "") -> None:
         """Report that commands are received, and the result of the newest one."""
@@ -217,7 +202,7 @@ class ActorRun:
             on_ready: Called once the shards of the actor's data have accepted what it requests and
                 its `start` is over; an actor that is stopped before never is ready.
         """
-        if not self._accepted():
+        if not self._reaches(self._bound.register):
             self._record.state = "stopped"
             self._report(now=True)
             return self.statistics()
@@ -230,9 +215,7 @@ class ActorRun:
                 on_ready()
             self._record.state = "running"
             self._report(now=True)
-            if self._sets is not None:
-                self._run_sets(self._sets)
-            elif self._bound.declaration.triggers:
+            if self._bound.declaration.triggers:
                 self._run_triggered()
             elif self._every_s is not None:
                 self._run_source(self._every_s)
@@ -258,14 +241,14 @@ class ActorRun:
             if call is not None and monotonic_ns() - call.since_ns >= REPORT_EVERY_NS:
                 self._report()
 
-    def _accepted(self) -> bool:
-        """Let the shards accept the actor's requests, waiting for them; False: stopped first."""
+    def _reaches(self, ask: Callable[[], object]) -> bool:
+        """Call `ask`, again while its shards are away; False: stopped first."""
         refused = 0
         while not self._stop.is_set():
             try:
-                self._bound.register()
+                ask()
             except LinkError as error:
-                self._record.refused(error, unknown=False)
+                self._record.refused(error)
                 if not refused:
                     log.warning("%s: not ready before its shards answer: %s", self.name, error)
                 self._report()
@@ -276,20 +259,26 @@ class ActorRun:
         return False
 
     def _run_triggered(self) -> None:
-        sweep_ns: float = 0 if self._once is not None else math.inf
-        with watching(self._bound, self._inbox) as changes:
+        """Run for what changes; of sets first for the newest existing one, then as they come."""
+        inbox, once = self._sets or self._inbox, self._once
+        sweep_ns: float = 0 if once is not None else math.inf
+        if self._sets is not None and not self._reaches(self._sets.start):
+            return
+        with Watching(self._bound, inbox) as changes:
             while not self._stop.is_set():
-                if self._once is not None and monotonic_ns() >= sweep_ns:
-                    sweep_ns = (
-                        monotonic_ns() + SWEEP_NS if not self._swept(self._once) else math.inf
-                    )
+                if once is not None and monotonic_ns() >= sweep_ns:
+                    sweep_ns = monotonic_ns() + SWEEP_NS if not self._swept(once) else math.inf
                 trigger = changes.take(STOP_LOOK_S)
                 if trigger is not None:
-                    attempt = self._attempt if self._once is None else self._attempt_once
-                    ending = attempt(trigger.entity)
+                    entity = trigger.entity if self._sets is None else None
+                    ending = (
+                        self._attempt_once(trigger.entity)
+                        if once is not None
+                        else self._attempt(entity, members=trigger.members)
+                    )
                     if isinstance(ending, REFUSALS):
                         pause_s = self._pause_s(trigger.refused)
-                        self._inbox.postpone(trigger, monotonic_ns() + round(pause_s * 1e9))
+                        inbox.postpone(trigger, monotonic_ns() + round(pause_s * 1e9))
                 self._report()
 
     def _swept(self, once: Once) -> bool:
@@ -298,28 +287,6 @@ class ActorRun:
         except REFUSALS as error:
             log.warning("%s: what was taken before is not known yet: %s", self.name, error)
             return False
-
-    def _run_sets(self, inbox: SetInbox) -> None:
-        """Run once per complete set: first for the newest existing one, then as they come."""
-        views, refused = self._bound.set_views(), 0
-        while not self._stop.is_set():
-            try:
-                inbox.start(captured_versions(session_of(views), views))
-                break
-            except LinkError as error:
-                self._record.refused(error, unknown=False)
-                self._report()
-                self._stop.wait(self._pause_s(refused))
-                refused += 1
-        with watching(self._bound, inbox) as changes:
-            while not self._stop.is_set():
-                trigger = changes.take(STOP_LOOK_S)
-                if trigger is not None:
-                    error_ = self._attempt(None, members=trigger.members)
-                    if isinstance(error_, REFUSALS):
-                        pause_s = self._pause_s(trigger.refused)
-                        inbox.postpone(trigger, monotonic_ns() + round(pause_s * 1e9))
-                self._report()
 
     def _run_source(self, every_s: float) -> None:
         rate = FixedRate(
@@ -426,7 +393,7 @@ class ActorRun:
         return None
 
     def _refused(self, entity: Entity | None, error: Exception) -> None:
-        self._record.refused(error, unknown=isinstance(error, CommitUnknownError))
+        self._record.refused(error)
         recovers = isinstance(error, LeaseLostError) and error.restarted
         level = logging.DEBUG if recovers else logging.WARNING
         log.log(level, "%s%s: refused: %s", self.name, _about(entity), error)

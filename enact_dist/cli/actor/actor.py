@@ -184,8 +184,7 @@ def _draw(config: CellConfig, file: Path) -> None:
         OSError: The file cannot be written.
     """
     from enact_dist.actor.check import declarations_of
-    from enact_dist.actor.drawing.graph import graph_of
-    from enact_dist.actor.drawing.svg import svg_of
+    from enact_dist.actor.graph import graph_of, svg_of
 
     if file.suffix.lower() != ".svg":
         raise ConfigError(f"--graph writes an SVG file; name it FILE.svg, not {file}")

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from enact_dist.actor.running.drain import DRAIN_S
-from enact_dist.actor.running.group import ANEW, ActorGroup, Life
-from enact_dist.actor.running.user_code import raised
+from enact_dist.actor.running.doing import raised
+from enact_dist.actor.running.group import ANEW, DRAIN_S, ActorGroup, Life
 from enact_dist.actor.running.words import ListeningForWords
 from enact_dist.cli.verbs import (
     DONE,

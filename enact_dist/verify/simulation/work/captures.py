@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.access.together import Captured, newest_set_ns
+from enact_dist.access.sets import Capture, newest_set_ns
 from enact_dist.core.protocol.datum import Slot
 from enact_dist.core.protocol.messages import AwaitStamp, Reached, Survey, Surveyed
 from enact_dist.core.protocol.placement import shard_of
@@ -65,9 +65,9 @@ class Captures:
 
     def _versions(
         self, host: ClientHost, slots: Iterable[Slot]
-    ) -> Steps[dict[Slot, list[Captured]]]:
+    ) -> Steps[dict[Slot, list[Capture]]]:
         """Return the retained versions of each slot, as far as its shard tells them."""
-        found: dict[Slot, list[Captured]] = {slot: [] for slot in slots}
+        found: dict[Slot, list[Capture]] = {slot: [] for slot in slots}
         message = Survey(
             tuple(dict.fromkeys(slot.context for slot in found)),
             tuple(dict.fromkeys(slot.entity for slot in found)),
@@ -85,7 +85,7 @@ class Captures:
             for state in answer.states:
                 if state.slot in found and state.version:
                     null = bool(state.null_reason)
-                    version = Captured(state.version, state.stamp_ns, state.captured_ns, null)
+                    version = Capture(state.version, state.stamp_ns, state.captured_ns, null)
                     found[state.slot].append(version)
         return found
 

@@ -1,9 +1,9 @@
-"""What `actor.check` looks at, and what it finds: actors, their requests, findings."""
+"""What `actor.check` and `actor.graph` look at: actors of a cell and their requests."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from enact_dist.actor.actor import narrowed, same_data, stands_for_trigger
 
@@ -12,8 +12,6 @@ if TYPE_CHECKING:
 
     from enact_dist.actor.actor import Actor, Declared
     from enact_dist.terms import Entity
-
-Level = Literal["error", "warning", "advice"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,26 +43,6 @@ class ActorDeclaration:
     def world_of(self, role: str) -> str | None:
         """Return the world context that a role is bound to."""
         return role if self.worlds is None else self.worlds.get(role)
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One thing that is wrong, or likely so, with the actors of a cell.
-
-    Attributes:
-        level: "error", "warning" or "advice".
-        kind: As in the table of `actor.check`.
-        actors: Names of the actors concerned.
-        text: What was found and what to do.
-    """
-
-    level: Level
-    kind: str
-    actors: tuple[str, ...]
-    text: str
-
-    def __str__(self) -> str:
-        return f"{self.level}: {self.kind}: {self.text}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 """Which sets of data that belong together an actor still has to look at; which are incomplete.
 
-PURE, as `actor.triggers`.  Rules that a change must keep:
+PURE: time arrives as an argument.  Rules that a change must keep:
 
 1. A set is complete when all members have shown a stamp of it, the same or within `within_ns` of
    each other; complete sets run one by one, in order.  A datum joins the nearest set that lacks it.
@@ -24,20 +24,31 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
-from enact_dist.actor.triggers import WHOLE, Trigger
+from enact_dist.access.trigger import WHOLE, Trigger
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from enact_dist.access.together import Captured
     from enact_dist.terms import Entity
 
 TOLD_MAX: Final = 16
 """Incomplete sets that are kept by name."""
 SET_BACK_NS: Final = 1_000_000_000
 """Versions of one datum are captured out of order by less than this."""
+
+
+class Capture(NamedTuple):
+    """One version of a slot: when it was committed and when its datum was captured.
+
+    `captured_ns` is 0 if unknown; `null` versions have no datum.
+    """
+
+    version: int
+    committed_ns: int
+    captured_ns: int
+    null: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +159,7 @@ class PendingSets:
         """Whether a set may run without these of its data."""
         return len(self._names) - len(missing) >= self._least
 
-    def start(self, versions: Sequence[Sequence[Captured]], now_ns: int = 0) -> None:
+    def start(self, versions: Sequence[Sequence[Capture]], now_ns: int = 0) -> None:
         """Take what there is when the actor starts; of each member, in the order of the names."""
         for member, each in enumerate(self._newest_of(versions)):
             self._take(member, each, now_ns)
@@ -164,10 +175,9 @@ class PendingSets:
         self.skipped = self.late = self.unstamped = self.partial = 0
         self._unstamped = [0] * len(self._names)
 
-    def _newest_of(self, versions: Sequence[Sequence[Captured]]) -> list[list[Captured]]:
+    def _newest_of(self, versions: Sequence[Sequence[Capture]]) -> list[list[Capture]]:
         """Return the newest versions of each member, and those of the newest set of one stamp."""
-        stamps = [{one.captured_ns for one in each if one.captured_ns} for each in versions]
-        common_ns = max(set.intersection(*stamps), default=0)
+        common_ns = newest_set_ns(versions)
         first = [len(each) - 8 * self._open_max for each in versions]
         return [
             [one for at, one in enumerate(each) if at >= start or one.captured_ns == common_ns]
@@ -182,7 +192,7 @@ class PendingSets:
         known = self._known.get(member, (0, 0))[0]
         return version not in (known, known + 1)
 
-    def captured(self, member: int, versions: Iterable[Captured], now_ns: int = 0) -> bool:
+    def captured(self, member: int, versions: Iterable[Capture], now_ns: int = 0) -> bool:
         """Take versions of one member, oldest first; return whether there is more to wait for.
 
         True where a set waits for its run, or now runs after a while without the missing ones.
@@ -190,7 +200,7 @@ class PendingSets:
         self._take(member, versions, now_ns)
         return self._settle(now_ns)
 
-    def captured_all(self, versions: Sequence[Iterable[Captured]], now_ns: int = 0) -> bool:
+    def captured_all(self, versions: Sequence[Iterable[Capture]], now_ns: int = 0) -> bool:
         """Take versions of all members, in the order of the names; as `captured`."""
         for member, each in enumerate(versions):
             self._take(member, each, now_ns)
@@ -227,7 +237,7 @@ class PendingSets:
         """Count a complete set whose data were outside retention before its update could run."""
         self._tell(stamp_ns, missing)
 
-    def _take(self, member: int, versions: Iterable[Captured], now_ns: int) -> None:
+    def _take(self, member: int, versions: Iterable[Capture], now_ns: int) -> None:
         for version, committed_ns, captured_ns, null in versions:
             if committed_ns <= self._known.get(member, (0, 0))[1]:
                 continue
@@ -351,3 +361,9 @@ class PendingSets:
             return self._due_ns
         runs_ns = min(map(self._runs_ns, self._open), default=float("inf"))
         return None if runs_ns == float("inf") else int(runs_ns)
+
+
+def newest_set_ns(versions: Sequence[Sequence[Capture]]) -> int:
+    """Return the largest capture stamp that all of them have, 0 if there is none."""
+    stamps = [{one.captured_ns for one in each if one.captured_ns} for each in versions]
+    return max(set.intersection(*stamps), default=0)

@@ -1,1 +1,0 @@
-"""Draw actors: who uses which aspects, as a graph and as a picture."""
