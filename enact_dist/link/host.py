@@ -58,9 +58,9 @@ from enact_dist.core.state.catalogue import REMEDY
 from enact_dist.core.state.clock import state_of, unkept_epoch
 from enact_dist.errors import StoreError
 from enact_dist.link.clock import Clock, SystemClock
-from enact_dist.link.host_figures import figures_of, latencies_of
-from enact_dist.link.host_guards import Stalls, Uninterrupted
+from enact_dist.link.host_figures import Stalls, figures_of, latencies_of
 from enact_dist.link.memory.payload_desk import PayloadDesk, half_of, names_payloads
+from enact_dist.link.signals import Uninterrupted
 
 if TYPE_CHECKING:
     from collections.abc import Callable

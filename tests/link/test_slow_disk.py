@@ -7,7 +7,7 @@ from quiet_moments import ATTEMPTS, met_once
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
 from enact_dist.errors import CommitUnknownError, ShardUnreachableError
-from enact_dist.link import host_guards as stalls
+from enact_dist.link import host_figures as stalls
 from enact_dist.link.client import locks as client
 from enact_dist.link.client import session as session_client
 from enact_dist.link.store.store import Store

@@ -8,7 +8,7 @@ import zenoh
 
 from enact_dist.core.protocol.messages import Hello, ListLocks, Ping
 from enact_dist.link.host import TICK_S_MAX
-from enact_dist.link.host_guards import STALL_S
+from enact_dist.link.host_figures import STALL_S
 from enact_dist.link.zenoh import service as zenoh_service
 from enact_dist.link.zenoh import turns
 from enact_dist.link.zenoh.config import close_session, open_session
