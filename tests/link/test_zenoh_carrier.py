@@ -25,7 +25,6 @@ from enact_dist.errors import (
     ProtocolError,
     ShardUnreachableError,
 )
-from enact_dist.link.zenoh import bulk as zenoh_bulk
 from enact_dist.link.zenoh import carrier as zenoh_carrier
 from enact_dist.link.zenoh import config as zenoh_config
 from enact_dist.link.zenoh.config import close_session, open_session
@@ -403,10 +402,9 @@ def test_connection_for_large_data_is_awaited_no_longer_than_that_for_calls(
         waits_s.append(open_s)
         return open_session(open_s=open_s, **options)
 
-    for module in (zenoh_bulk, zenoh_carrier):
-        monkeypatch.setattr(module, "open_session", noted)
+    monkeypatch.setattr(zenoh_carrier, "open_session", noted)
     carrier = zenoh_carrier.ZenohCarrier("cell", "me", "me", [endpoint], ttl_s=2.0, open_s=1.5)
-    carrier._links[0].bulk.session()
+    carrier._links[0].bulk()
     carrier.close()
 
     assert waits_s == [1.5, 1.5]

@@ -17,9 +17,9 @@ import zenoh
 
 from enact_dist.link.zenoh import config as zenoh_config
 from enact_dist.link.zenoh import links as zenoh_links
-from enact_dist.link.zenoh.carrier import wait_connected
 from enact_dist.link.zenoh.config import close_session, open_session
 from enact_dist.link.zenoh.links import _lost_after, connections, give_up, settle, unanswered
+from enact_dist.link.zenoh.queries import wait_connected
 
 LINGER = struct.Struct("ii")
 ZENOHS = (1, 10)

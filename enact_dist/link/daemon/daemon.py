@@ -37,8 +37,7 @@ from enact_dist.link.log import READY, JsonLines, Log, TextLines, say
 from enact_dist.link.memory.shared_folder import SharedFolder
 from enact_dist.link.signals import StopSignals
 from enact_dist.link.socket.service import SocketService
-from enact_dist.link.zenoh.access import listening_settings
-from enact_dist.link.zenoh.config import close_session, open_session, to_reach
+from enact_dist.link.zenoh.config import close_session, listening_settings, open_session, to_reach
 from enact_dist.link.zenoh.discovery import FoundShard, find_shards
 from enact_dist.link.zenoh.endpoints import somebody_listens
 from enact_dist.link.zenoh.service import ZenohService

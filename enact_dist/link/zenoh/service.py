@@ -25,21 +25,15 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import zenoh
 
-from enact_dist.core.protocol.messages import (
-    Answer,
-    Fetch,
-    Ping,
-    Refused,
-    Request,
-    Stage,
-)
+from enact_dist.core.protocol.messages import Answer, Fetch, Ping, Refused, Request, Stage
 from enact_dist.core.protocol.records import SessionSeen
 from enact_dist.core.shard.owners import named_session
 from enact_dist.errors import ProtocolError
+from enact_dist.link.answers import encoded, size_of
 from enact_dist.link.memory.maps import recycle_blocks
 from enact_dist.link.zenoh.config import QUEUED_MAX, keep_after_fork
-from enact_dist.link.zenoh.senders import Senders, encoded, size_of
-from enact_dist.link.zenoh.turns import Turns
+from enact_dist.link.zenoh.fairness import Senders, Turns
+from enact_dist.link.zenoh.queries import bytes_of
 from enact_dist.wire.frames import decode_request, encode_frame
 from enact_dist.wire.keys import (
     ANY,
@@ -231,10 +225,7 @@ class ZenohService:
     def _take(self, arrived: _Arrived) -> None:
         query, key, header, payload, burst = arrived
         try:
-            message = decode_request(
-                bytes(header) if header is not None else b"",
-                bytes(payload) if payload is not None else b"",
-            )
+            message = decode_request(bytes_of(header), bytes_of(payload))
             cell, shard, verb, identity = parse_request_key(key)
             if verb != verb_of(message):
                 raise ProtocolError(f"a {verb_of(message)} came on the key of a {verb}")

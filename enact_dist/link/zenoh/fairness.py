@@ -1,7 +1,10 @@
-"""Decides which thread sends an answer: the one that made it, or the client's own sender.
+"""Keeps the clients of a shard from delaying each other, both with requests and with answers.
 
-Sending to a client that does not read can block until its connection is closed.  To delay no other
-client, the dispatcher sends an answer itself only while the client has less than
+`Turns`: a request waits for earlier requests of its own client and for at most one of each other
+client, however many those have sent.
+
+`Senders`: sending to a client that does not read can block until its connection is closed.  The
+dispatcher therefore sends an answer itself only while the client has less than
 `OUTSTANDING_BYTES_MAX` outstanding: that fits into the connection's buffers, so the call returns at
 once and no other thread has to be woken (30 us of a 200 us round trip).  Everything beyond goes, in
 order, to a thread of that client.
@@ -11,8 +14,8 @@ sent proves that its client lives and reads.  Requests that waited in the inbox 
 new burst starts only when the inbox was found empty (`new_burst`), and a client's outstanding bytes
 are reset by its first request in a new burst (`heard`).
 
-Every queue is bounded; excess answers are dropped and counted.  A dropped answer is *unknown* to
-the client, which repeats its request.
+Every queue is bounded; excess requests and answers are dropped and counted.  A dropped one is
+*unknown* to the client, which repeats its request.
 """
 
 from __future__ import annotations
@@ -20,37 +23,24 @@ from __future__ import annotations
 import logging
 import threading
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Protocol
-
-from enact_dist.core.protocol.messages import (
-    Audited,
-    Granted,
-    Locks,
-    Registered,
-    Sessions,
-    Slice,
-    Surveyed,
-    Versions,
-    Viewed,
-    Welcome,
-)
-from enact_dist.core.protocol.pages import bytes_in_frame
-from enact_dist.errors import ProtocolError
-from enact_dist.wire.frames import encode_parts, refusal_of
+from typing import TYPE_CHECKING, Final, Generic, Protocol, TypeVar
 
 if TYPE_CHECKING:
-    from enact_dist.core.protocol.messages import Answer
+    from collections.abc import Callable
 
+T = TypeVar("T")
+
+OF_ONE_MAX: Final = 4_096
+"""Requests of one client that may wait: four times as many as a session has threads."""
+OF_ONE_BYTES_MAX: Final = 128 << 20
+"""Bytes of one client's requests that may wait: 16 transfers of large data."""
+OF_ALL_MAX: Final = 65_536
+"""Requests of all clients together that may wait."""
+OF_ALL_BYTES_MAX: Final = 512 << 20
+"""Bytes of all requests together that may wait."""
 OUTSTANDING_BYTES_MAX: Final = 64 << 10
 """What a client may have outstanding before its own sender takes over: one transport batch."""
-SURVEYED_BYTES: Final = 160
-"""Estimated length of one slot in the answer to a `Survey`."""
-VERSION_BYTES: Final = 1024
-"""Estimated length of one version, its cause included, in a listing."""
-CATALOGUE_BYTES: Final = 64
-"""Estimated length of one world context or aspect in a catalogue."""
 QUEUED_ANSWERS_MAX: Final = 1024
 """Answers that wait for one client; a client has some calls per thread in flight."""
 QUEUED_BYTES_MAX: Final = 256 << 20
@@ -65,6 +55,73 @@ ANSWER_OVERHEAD_BYTES: Final = 256
 """Overhead that each answer adds to the size of its data."""
 
 _log = logging.getLogger("enact.link")
+
+
+class _Queue(Generic[T]):
+    """The waiting requests of one client."""
+
+    __slots__ = ("bytes", "waiting")
+
+    def __init__(self) -> None:
+        self.waiting: deque[tuple[int, int, T]] = deque()
+        self.bytes = 0
+
+
+class Turns(Generic[T]):
+    """The waiting requests, by client.  For one thread.
+
+    Attributes:
+        put_count: Number of requests added so far; each is numbered by the count before it.
+    """
+
+    __slots__ = ("_bytes", "_queues", "_rotation", "_size", "put_count")
+
+    def __init__(self) -> None:
+        self._queues: dict[str, _Queue[T]] = {}
+        self._rotation: deque[str] = deque()
+        self._size = self._bytes = 0
+        self.put_count = 0
+
+    def __len__(self) -> int:
+        return self._size
+
+    def put(self, client: str, size: int, request: T) -> bool:
+        """Add a request of `size` bytes; return False if it does not fit.
+
+        A client without waiting requests may add one of any size.
+        """
+        if self._size >= OF_ALL_MAX or self._bytes + size > OF_ALL_BYTES_MAX:
+            return False
+        queue = self._queues.get(client)
+        if queue is None:
+            queue = self._queues[client] = _Queue()
+            self._rotation.append(client)
+        elif len(queue.waiting) >= OF_ONE_MAX or queue.bytes + size > OF_ONE_BYTES_MAX:
+            return False
+        queue.waiting.append((self.put_count, size, request))
+        queue.bytes += size
+        self._size += 1
+        self._bytes += size
+        self.put_count += 1
+        return True
+
+    def take(self) -> tuple[int, T]:
+        """Remove the next request; return it with its number, and pass the turn to the next client.
+
+        Raises:
+            IndexError: No request waits.
+        """
+        client = self._rotation.popleft()
+        queue = self._queues[client]
+        number, size, request = queue.waiting.popleft()
+        self._size -= 1
+        self._bytes -= size
+        if queue.waiting:
+            queue.bytes -= size
+            self._rotation.append(client)
+        else:
+            del self._queues[client]
+        return number, request
 
 
 class Parcel(Protocol):
@@ -235,47 +292,3 @@ class _Sender:
                 self._in_hand = 0
             elif self._may_end(self):
                 return
-
-
-def encoded(
-    answer: Answer, count: Callable[[str, int], None]
-) -> tuple[bytes, list[bytes | memoryview]]:
-    """Return header and bodies of an answer, or of a refusal if it cannot be encoded."""
-    try:
-        return encode_parts(answer)
-    except ProtocolError as error:
-        count("answers_refused", 1)
-        _log.warning("answer %s became a refusal: %s", type(answer).__name__, error)
-        return encode_parts(refusal_of(error))
-
-
-def size_of(answer: Answer) -> int:
-    """Estimate the length of an answer's data in bytes, without encoding it."""
-    estimate = _SIZE_OF.get(type(answer))
-    return estimate(answer) if estimate is not None else 0
-
-
-def _size_of_states(answer: Granted | Viewed) -> int:
-    size = SURVEYED_BYTES * len(answer.states)
-    for state in answer.states:
-        if state.datum is not None and not state.large:
-            size += state.size
-    return size
-
-
-def _size_of_catalogue(answer: Welcome | Registered) -> int:
-    return CATALOGUE_BYTES * (len(answer.worlds) + len(answer.aspects))
-
-
-_SIZE_OF: Final[dict[type, Callable[[Any], int]]] = {
-    Granted: _size_of_states,
-    Viewed: _size_of_states,
-    Welcome: _size_of_catalogue,
-    Registered: _size_of_catalogue,
-    Slice: lambda answer: answer.body.size,
-    Surveyed: lambda answer: SURVEYED_BYTES * len(answer.states),
-    Versions: lambda answer: VERSION_BYTES * len(answer.entries),
-    Locks: lambda answer: bytes_in_frame(answer.holders),
-    Sessions: lambda answer: bytes_in_frame(answer.sessions + answer.aspects),
-    Audited: lambda answer: bytes_in_frame(answer.entries),
-}
