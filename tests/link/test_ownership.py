@@ -109,7 +109,7 @@ def test_message_on_the_key_of_another_verb_is_refused(daemon, endpoint, strange
     answer = stranger(m.ListLocks(), "eve@h:1", verb="survey")
 
     assert isinstance(answer, m.Refused)
-    assert answer.text == "a list_locks came on the key of a survey"
+    assert answer.text == "a list_locks arrived on the key of a survey"
     assert shard.host._shard.counters["frames_refused"] == 1
 
 

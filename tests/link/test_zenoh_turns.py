@@ -212,4 +212,4 @@ def test_requests_without_room_are_dropped_counted_and_named(stopped, sender, mo
 
     assert sender.answered == ["x", "a0", "b0", "a1", "a2", "a3", "a4"]
     assert stopped.host.figures()["requests_dropped"] == 15
-    assert [r.getMessage() for r in caplog.records if "too many requests of a," in r.getMessage()]
+    assert [r.getMessage() for r in caplog.records if "too many requests from a," in r.getMessage()]

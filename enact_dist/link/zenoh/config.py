@@ -61,7 +61,7 @@ OPEN_S: Final = 5.0
 CLIENT_BLOCK_S: Final = 3.0
 """How long a client waits for a shard that does not read before it closes the connection; no
 shard waits longer for a client either."""
-PATIENCE: Final = 0.75
+UNACKNOWLEDGED: Final = 0.75
 """How much of a link's lease a shard's bytes may stay unacknowledged: less than all of it, so
 that the kernel gives up before anything closes the link.
 """
@@ -213,9 +213,9 @@ def open_session(
     except zenoh.ZError as error:
         raise _open_error(error, listen) from None
     _open_sessions.append((os.getpid(), session))
-    patience_s = min(PATIENCE * lease_s, CLIENT_BLOCK_S) if listen else CLIENT_BLOCK_S
+    user_timeout_s = min(UNACKNOWLEDGED * lease_s, CLIENT_BLOCK_S) if listen else CLIENT_BLOCK_S
     try:
-        _watches[session] = watch = LinkWatch(session, connect, patience_s)
+        _watches[session] = watch = LinkWatch(session, connect, user_timeout_s)
     except BaseException:  # the system has no more threads, for example
         close_session(session)
         raise

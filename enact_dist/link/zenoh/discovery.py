@@ -11,9 +11,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.protocol.messages import Refused, Welcome
-from enact_dist.errors import ProtocolError, ShardUnreachableError
-from enact_dist.link.refusals import error_of
+from enact_dist.core.protocol.messages import Welcome
+from enact_dist.errors import ShardUnreachableError
+from enact_dist.link.refusals import error_for
 from enact_dist.link.zenoh.config import close_session, open_session
 from enact_dist.link.zenoh.endpoints import unknown_hosts
 from enact_dist.link.zenoh.queries import (
@@ -74,10 +74,8 @@ def discover(endpoints: Sequence[str], hello: Hello, *, timeout_s: float) -> tup
                 answer = _greet(session, found, hello, deadline_s)
                 if isinstance(answer, Welcome):
                     return found.cell, answer
-                if isinstance(answer, Refused):
-                    raise error_of(answer)
                 if answer is not None:
-                    raise ProtocolError(f"shard {found.shard} answered a hello with {answer!r}")
+                    raise error_for(answer, f"a hello to shard {found.shard}")
     where = ", ".join(endpoints)
     if silent:
         raise ShardUnreachableError(

@@ -23,7 +23,6 @@ from __future__ import annotations
 import logging
 import threading
 from collections import deque
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Generic, Protocol, TypeVar
 
 if TYPE_CHECKING:
@@ -138,13 +137,17 @@ class Parcel(Protocol):
         """Drop it: the client gets no answer.  Never raises."""
 
 
-@dataclass(slots=True)
-class _Account:
-    """A client's outstanding bytes, and its sender while it has one."""
+class _Client:
+    """What one client has outstanding, what waits for it, and its thread while it has one."""
 
-    burst: int
-    bytes: int = 0
-    sender: _Sender | None = None
+    __slots__ = ("burst", "outstanding", "parcels", "queued", "sending", "served", "wake")
+
+    def __init__(self, burst: int, mutex: threading.Lock) -> None:
+        self.burst = burst
+        self.outstanding = self.queued = 0
+        self.parcels: deque[Parcel] = deque()
+        self.served = self.sending = False
+        self.wake = threading.Condition(mutex)
 
 
 class Senders:
@@ -159,7 +162,7 @@ class Senders:
 
     def __init__(self, count: Callable[[str, int], None]) -> None:
         self._count = count
-        self._accounts: dict[str, _Account] = {}
+        self._clients: dict[str, _Client] = {}
         self._mutex = threading.Lock()
         self.burst = 0
         self._senders = 0
@@ -169,126 +172,89 @@ class Senders:
         """Note that the inbox was empty: later requests were sent after all earlier answers."""
         self.burst += 1
 
-    def heard(self, client: str, burst: int | None = None) -> None:
-        """Note a request of `client`: it has read what was sent to it in earlier bursts.
+    def heard(self, name: str, burst: int | None = None) -> None:
+        """Note a request of a client: it has read what was sent to it in earlier bursts.
 
         `burst` is the burst in which the request arrived; None: the present one.
         """
-        account = self._accounts.get(client)
-        if account is not None and account.burst < (self.burst if burst is None else burst):
-            account.burst = self.burst
-            account.bytes = 0
+        client = self._clients.get(name)
+        if client is not None and client.burst < (self.burst if burst is None else burst):
+            client.burst = self.burst
+            client.outstanding = 0
 
-    def send(self, client: str, parcel: Parcel) -> None:
-        """Send `parcel` in this thread, or queue it for the client's own sender."""
+    def send(self, name: str, parcel: Parcel) -> None:
+        """Send `parcel` to a client in this thread, or queue it for the client's own sender."""
         with self._mutex:
-            account = self._account_of(client)
-            account.bytes += parcel.size + ANSWER_OVERHEAD_BYTES
-            idle = account.sender is None or account.sender.idle
-            direct = idle and account.bytes < OUTSTANDING_BYTES_MAX
-            queued = direct or self._queue(account, parcel)
+            client = self._client(name)
+            client.outstanding += parcel.size + ANSWER_OVERHEAD_BYTES
+            idle = not client.parcels and not client.sending
+            direct = idle and client.outstanding < OUTSTANDING_BYTES_MAX
+            queued = direct or self._queue(client, parcel)
         if direct:
             parcel.send()
         elif not queued:
             parcel.drop()
             self._count("answers_dropped", 1)
 
-    def _account_of(self, client: str) -> _Account:
-        account = self._accounts.get(client)
-        if account is None:
-            if len(self._accounts) >= CLIENTS_MAX:
-                idle = next((c for c, a in self._accounts.items() if a.sender is None), None)
-                if idle is not None:
-                    del self._accounts[idle]
-            account = self._accounts[client] = _Account(self.burst)
-        return account
+    def _client(self, name: str) -> _Client:
+        client = self._clients.get(name)
+        if client is None:
+            if len(self._clients) >= CLIENTS_MAX:
+                unserved = next((n for n, c in self._clients.items() if not c.served), None)
+                if unserved is not None:
+                    del self._clients[unserved]
+            client = self._clients[name] = _Client(self.burst, self._mutex)
+        return client
 
-    def _queue(self, account: _Account, parcel: Parcel) -> bool:
-        if self._closed:
+    def _queue(self, client: _Client, parcel: Parcel) -> bool:
+        """Leave a parcel to the client's sender; return whether there is room and a thread."""
+        full = len(client.parcels) >= QUEUED_ANSWERS_MAX or client.queued >= QUEUED_BYTES_MAX
+        if self._closed or full or not (client.served or self._start(client)):
             return False
-        if account.sender is None:
-            if self._senders >= SENDERS_MAX:
-                return False
-            try:
-                account.sender = _Sender(lambda sender: self._idle(account, sender))
-            except RuntimeError as error:  # the system has no more threads
-                _log.warning("an answer is lost: %s", error)
-                return False
-            self._senders += 1
-        return account.sender.put(parcel)
+        client.parcels.append(parcel)
+        client.queued += parcel.size
+        client.wake.notify()
+        return True
 
-    def _idle(self, account: _Account, sender: _Sender) -> bool:
-        """Remove an idle sender; return False if it got a parcel meanwhile."""
-        with self._mutex:
-            if not sender.idle:
-                return False
-            account.sender = None
-            self._senders -= 1
-            return True
+    def _start(self, client: _Client) -> bool:
+        """Start the client's sender; return whether a thread was free."""
+        if self._senders >= SENDERS_MAX:
+            return False
+        run = threading.Thread(target=self._serve, args=(client,), name="enact-sender", daemon=True)
+        try:
+            run.start()
+        except RuntimeError as error:  # the system has no more threads
+            _log.warning("no thread sends a large answer, which is dropped: %s", error)
+            return False
+        client.served = True
+        self._senders += 1
+        return True
+
+    def _serve(self, client: _Client) -> None:
+        """Send what waits for one client, until nothing does for a while."""
+        while True:
+            with self._mutex:
+                client.sending = False
+                client.wake.wait_for(lambda: client.parcels or self._closed, IDLE_S)
+                if self._closed or not client.parcels:
+                    client.served = False
+                    self._senders -= 1
+                    return
+                client.sending = True
+                parcel = client.parcels.popleft()
+                client.queued -= parcel.size
+            try:
+                parcel.send()
+            except Exception:  # noqa: BLE001 - all that waits for this client would wait for ever
+                _log.exception("an answer of %d bytes was not sent", parcel.size)
 
     def close(self) -> None:
         """Stop all sender threads; queued answers are dropped, a blocked call ends by itself."""
         with self._mutex:
             self._closed = True
-            senders = [account.sender for account in self._accounts.values() if account.sender]
-        for sender in senders:
-            sender.close()
-
-
-class _Sender:
-    """One client's own thread, alive while it has something to send."""
-
-    def __init__(self, may_end: Callable[[_Sender], bool]) -> None:
-        self._may_end = may_end
-        self._parcels: deque[Parcel] = deque()
-        self._bytes = 0
-        self._in_hand = 0
-        self._changed = threading.Condition(threading.Lock())
-        self._closed = False
-        threading.Thread(target=self._run, name="enact-sender", daemon=True).start()
-
-    @property
-    def idle(self) -> bool:
-        """Whether nothing waits and nothing is being sent."""
-        return not self._parcels and not self._in_hand
-
-    def put(self, parcel: Parcel) -> bool:
-        """Queue a parcel; False if the queue is full."""
-        with self._changed:
-            full = len(self._parcels) >= QUEUED_ANSWERS_MAX or self._bytes >= QUEUED_BYTES_MAX
-            if full or self._closed:
-                return False
-            self._parcels.append(parcel)
-            self._bytes += parcel.size
-            self._changed.notify()
-        return True
-
-    def close(self) -> None:
-        """Drop the queue, and end once the present parcel is sent or dropped."""
-        with self._changed:
-            self._closed = True
-            parcels = list(self._parcels)
-            self._parcels.clear()
-            self._changed.notify()
-        for parcel in parcels:
+            dropped = [parcel for client in self._clients.values() for parcel in client.parcels]
+            for client in self._clients.values():
+                client.parcels.clear()
+                client.wake.notify()
+        for parcel in dropped:
             parcel.drop()
-
-    def _run(self) -> None:
-        while True:
-            with self._changed:
-                if not self._changed.wait_for(lambda: self._parcels or self._closed, IDLE_S):
-                    parcel = None
-                elif self._closed:
-                    return
-                else:
-                    self._in_hand = 1
-                    parcel = self._parcels.popleft()
-                    self._bytes -= parcel.size
-            if parcel is not None:
-                try:
-                    parcel.send()
-                except Exception:  # noqa: BLE001 - all that waits for this client would wait for ever
-                    _log.exception("an answer of %d bytes is lost", parcel.size)
-                self._in_hand = 0
-            elif self._may_end(self):
-                return

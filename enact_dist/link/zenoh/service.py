@@ -198,8 +198,8 @@ class ZenohService:
         if client not in self._told and len(self._told) < TOLD_MAX:
             self._told.add(client)
             _log.warning(
-                "shard %s: too many requests of %s, or of all clients, wait; some were dropped, and"
-                " further ones are only counted",
+                "shard %s: too many requests from %s, or from all clients, are waiting; some were"
+                " dropped, and further ones are only counted",
                 self._host.name,
                 client,
             )
@@ -228,9 +228,11 @@ class ZenohService:
             message = decode_request(bytes_of(header), bytes_of(payload))
             cell, shard, verb, identity = parse_request_key(key)
             if verb != verb_of(message):
-                raise ProtocolError(f"a {verb_of(message)} came on the key of a {verb}")
+                raise ProtocolError(f"a {verb_of(message)} arrived on the key of a {verb}")
             if (ANY in cell or ANY in shard) and type(message) is not Ping:
-                raise ProtocolError(f"a {verb} came to several shards at once; only a ping may")
+                raise ProtocolError(
+                    f"a {verb} was sent to several shards at once; only a ping may be"
+                )
         except Exception as error:  # noqa: BLE001 - every query is answered
             if not isinstance(error, ProtocolError):
                 # A bug in the decoder: a client that triggers it must not stop the dispatcher.
@@ -275,7 +277,7 @@ class ZenohService:
         try:
             self._host.submit(message, call, identity)
         except Exception:  # noqa: BLE001 - these threads serve all clients
-            _log.exception("a %s was not stored", type(message).__name__)
+            _log.exception("a %s could not be handled", type(message).__name__)
             call.drop()
 
     def reply_key(self, query: zenoh.Query) -> zenoh.KeyExpr | str:
