@@ -44,7 +44,11 @@ def encoded(
         return encode_parts(answer)
     except ProtocolError as error:
         count("answers_refused", 1)
-        _log.warning("answer %s became a refusal: %s", type(answer).__name__, error)
+        _log.warning(
+            "answer %s cannot be encoded, so the client gets a refusal: %s",
+            type(answer).__name__,
+            error,
+        )
         return encode_parts(refusal_of(error))
 
 

@@ -86,15 +86,17 @@ class Stalls:
         looked_s, self._looked_s = self._looked_s, now_s
         if looked_s is not None and now_s - looked_s >= STALL_S:
             _log.warning(
-                "shard %s had no turn for %.1f s: its process was stopped, or others used the"
-                " processors",
+                "shard %s did not run for %.1f s: its process was stopped, or other processes used"
+                " the processors",
                 self._shard,
                 now_s - looked_s,
             )
         told_s = self._writing_since_s
         if told_s is not None and writing_since_s != told_s:
             self._writing_since_s = None
-            _log.warning("the disk of shard %s is back after %.1f s", self._shard, now_s - told_s)
+            _log.warning(
+                "the disk of shard %s writes again after %.1f s", self._shard, now_s - told_s
+            )
         elif told_s is None and writing_since_s is not None and now_s - writing_since_s >= STALL_S:
             self._writing_since_s = writing_since_s
             self._count("disk_stalls")

@@ -111,7 +111,7 @@ def test_disk_that_stands_still_is_told_to_the_log(daemon, endpoint, tmp_path, d
 
     assert len(told) == 2, told
     assert "has written nothing for" in told[0]
-    assert "is back after" in told[1]
+    assert "writes again after" in told[1]
     assert shard.host._shard.counters["disk_stalls"] == 1
 
 
@@ -135,5 +135,5 @@ def test_shard_without_a_turn_is_told_to_the_log(caplog):
         watch.look(None, now_s)
 
     (told,) = (record.getMessage() for record in caplog.records)
-    assert "shard s0 had no turn for 11.8 s" in told
+    assert "shard s0 did not run for 11.8 s" in told
     assert counted == []

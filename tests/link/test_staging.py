@@ -203,7 +203,7 @@ def test_answer_that_does_not_fit_is_an_error(answer):
     """Neither a refusal nor the answer to something else passes for a slice that has come."""
     way = Way()
     way.carry = lambda *_: answer
-    with pytest.raises(EnactError, match=r"nonsense|Staged came"):
+    with pytest.raises(EnactError, match=r"nonsense|answered with a Staged"):
         stage(way, {"s0": [write_of("a", 100_000)]}, lambda: None)
 
 

@@ -41,9 +41,8 @@ from enact_dist.errors import EnactError, MisuseError
 from enact_dist.link.carrier import FORKED_REMEDY
 from enact_dist.link.client.calls import CALL_S, Calls, patience_s
 from enact_dist.link.client.catalogue import CATALOGUES, FurtherShards, KnownCatalogue
-from enact_dist.link.client.dropped import weakly
 from enact_dist.link.client.lanes import Lanes
-from enact_dist.link.client.pauses import Pauses, Renewal, keep_renewing
+from enact_dist.link.client.pauses import Pauses, Renewal, keep_renewing, weakly
 from enact_dist.link.clock import boottime_ns
 from enact_dist.link.memory.names import FIRST_STAGED
 from enact_dist.link.memory.payload_client import SharedPayloads

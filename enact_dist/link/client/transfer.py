@@ -24,28 +24,26 @@ from __future__ import annotations
 import logging
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import chain, zip_longest
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 from enact_dist.core.protocol.datum import Datum
-from enact_dist.core.protocol.messages import EpochChanged, Refused, Stage, Staged, WriteItem
+from enact_dist.core.protocol.messages import EpochChanged, Stage, Staged, WriteItem
 from enact_dist.errors import (
     SHARD_RESTARTED,
     EnactError,
     LeaseLostError,
-    ProtocolError,
     ShardUnreachableError,
 )
 from enact_dist.link.client.calls import BYTES_PER_S_MIN, CALL_S
 from enact_dist.link.memory.names import FIRST_STAGED
-from enact_dist.link.refusals import error_of, unreachable
+from enact_dist.link.refusals import error_for, unreachable
 from enact_dist.wire.limits import PAYLOAD_BYTES_MIN
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from enact_dist.core.client.client import Client
     from enact_dist.core.protocol.messages import Answer, Request
@@ -179,9 +177,7 @@ def _check_staged(shard: str, file: str, answer: Answer) -> None:
             " it: the lock is lost and nothing was written; take it again and redo the work",
             cause=SHARD_RESTARTED,
         )
-    if isinstance(answer, Refused):
-        raise error_of(answer)
-    raise ProtocolError(f"{type(answer).__name__} came as the answer to a slice of {file}")
+    raise error_for(answer, f"a slice of {file}")
 
 
 WINDOW_BYTES: Final = 8 << 20

@@ -25,9 +25,9 @@ from enact_dist.errors import ConfigError, EnactError, LinkError
 from enact_dist.link.client.calls import Calls
 from enact_dist.link.client.namesakes import (
     Comparing,
+    expected_places,
     moved_places,
     serving,
-    told_places,
     two_daemons,
 )
 from enact_dist.link.daemon.service_manager import ServiceManager
@@ -173,12 +173,9 @@ class RunningShard:
             if not self.host.wait_idle(drain_s):
                 self._name_holders(drain_s)
             self.host.drain()  # requests parked meanwhile are answered, too
-            self.host.close()
-            self._calls.close()
-            self._comparing.close()
-            if self._sockets is not None:
-                self._sockets.close()
-            self._service.close()
+            for part in (self.host, self._calls, self._comparing, self._sockets, self._service):
+                if part is not None:
+                    part.close()
             close_session(self._session)
             if self._metrics is not None:
                 self._metrics.close()
@@ -207,9 +204,9 @@ class RunningShard:
             ]
         if held:
             _log.warning(
-                "%d locks are lost, still held when the drain of %g s was over: %s; to give them"
-                " more time: --drain, or ENACT_SHARD_<NAME>_DRAIN_S, or drain_s in [shards.%s] of"
-                " cell.toml; the first of these that is set counts",
+                "%d locks are lost because they were still held when the drain of %g s ended: %s;"
+                " to give them more time, set --drain, ENACT_SHARD_<NAME>_DRAIN_S, or drain_s in"
+                " [shards.%s] of cell.toml; the first of these that is set counts",
                 len(held),
                 drain_s,
                 "; ".join(held),
@@ -281,8 +278,8 @@ def refuse_second_daemon(settings: DaemonSettings, *, probe_s: float = PROBE_S) 
             " must not serve one shard: stop the other, or give this one another name"
         )
     others = [entry for entry in shards if entry.name != name]
-    told = told_places(cell, others, timeout_s=probe_s) if others else ()
-    for shard, places in moved_places(expected, chain.from_iterable(told)).items():
+    reported = expected_places(cell, others, timeout_s=probe_s) if others else ()
+    for shard, places in moved_places(expected, chain.from_iterable(reported)).items():
         daemons = serving(cell, shard, places, timeout_s=probe_s)
         if shard == name and daemons:
             raise LinkError(

@@ -131,7 +131,9 @@ class _Server(ThreadingMixIn, TCPServer):
             self._room.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        _log.info("a reader of the metrics at %s left in mid-answer", client_address)
+        _log.info(
+            "a reader of the metrics at %s disconnected before it had the answer", client_address
+        )
 
 
 class _Handler(BaseHTTPRequestHandler):

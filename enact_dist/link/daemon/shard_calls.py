@@ -91,7 +91,7 @@ class ShardCalls:
         try:
             line = self._lines[shard] = _Line(self, shard, self._endpoints[shard], self._lease_s)
         except RuntimeError as error:
-            _log.warning("no call to shard %s now: %s", shard, error)
+            _log.warning("cannot call shard %s now: %s", shard, error)
             return None
         return line
 
