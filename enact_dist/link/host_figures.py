@@ -91,13 +91,15 @@ class Stalls:
                 self._shard,
                 now_s - looked_s,
             )
-        told_s = self._writing_since_s
-        if told_s is not None and writing_since_s != told_s:
+        stalled_s = self._writing_since_s
+        if stalled_s is not None and writing_since_s != stalled_s:
             self._writing_since_s = None
             _log.warning(
-                "the disk of shard %s writes again after %.1f s", self._shard, now_s - told_s
+                "the disk of shard %s writes again after %.1f s", self._shard, now_s - stalled_s
             )
-        elif told_s is None and writing_since_s is not None and now_s - writing_since_s >= STALL_S:
+        elif (
+            stalled_s is None and writing_since_s is not None and now_s - writing_since_s >= STALL_S
+        ):
             self._writing_since_s = writing_since_s
             self._count("disk_stalls")
             _log.warning(

@@ -80,7 +80,7 @@ class ShardCalls:
             if self._closed:
                 return
             if shard not in self._endpoints:
-                self._tell_unknown(shard)
+                self._log_unknown(shard)
                 return
             line = self._lines.get(shard) or self._opened(shard)
         if line is not None:
@@ -107,7 +107,7 @@ class ShardCalls:
         """Report that a shard is within reach."""
         self._returned(shard)
 
-    def _tell_unknown(self, shard: str) -> None:
+    def _log_unknown(self, shard: str) -> None:
         """Log once that a lock was prepared with a shard that the cell no longer has."""
         if shard not in self._unknown:
             self._unknown[shard] = None
@@ -144,7 +144,7 @@ class _Line:
         self._session: zenoh.Session | None = None
         self._presence: ShardPresence | None = None
         self._silent_since_s: float | None = None
-        self._silence_told = False
+        self._silence_logged = False
         keep_after_fork(self)
         self._thread = threading.Thread(target=self._run, name="enact-calls", daemon=True)
         self._thread.start()
@@ -193,12 +193,12 @@ class _Line:
     def _watch(self, session: zenoh.Session, key: str) -> None:
         """Watch the shard; on failure the next calls try again, and these are made anyway."""
         try:
-            self._presence = ShardPresence(session, key, self._tell_returned)
+            self._presence = ShardPresence(session, key, self._report_return)
         except (zenoh.ZError, RuntimeError) as error:  # closed meanwhile, or no thread available
             if not self._ending:
                 _log.warning("shard %s is not watched at the moment: %s", self._shard, error)
 
-    def _tell_returned(self) -> None:
+    def _report_return(self) -> None:
         if not self._ending:
             self._calls.pass_return(self._shard)
 
@@ -206,14 +206,18 @@ class _Line:
         """Log once that the shard is away, and once that it is back."""
         now_s = time.monotonic()
         if answered:
-            if self._silence_told:
+            if self._silence_logged:
                 _log.info("shard %s answers again", self._shard)
-            self._silent_since_s, self._silence_told = None, False
+            self._silent_since_s, self._silence_logged = None, False
             return
         if self._silent_since_s is None:
             self._silent_since_s = now_s
-        if not self._silence_told and now_s - self._silent_since_s >= SILENT_S and not self._ending:
-            self._silence_told = True
+        if (
+            not self._silence_logged
+            and now_s - self._silent_since_s >= SILENT_S
+            and not self._ending
+        ):
+            self._silence_logged = True
             _log.warning(
                 "shard %s at %s does not answer; commits over it and this shard wait for it, and"
                 " keep their locks here (enact lock ls)",

@@ -312,8 +312,8 @@ class ZenohCarrier:
             self._link_of[name] = reaching or self._open_link(endpoints)
         if name not in self._presences:
             session, key = self._link_of[name].session, self._key(name, QUESTION)
-            told = partial(self._tell_returned, name)
-            self._presences[name] = ShardPresence(session, key, told)
+            returned = partial(self._report_return, name)
+            self._presences[name] = ShardPresence(session, key, returned)
 
     def _link_reaching(self, shard: str, endpoints: Sequence[str]) -> _Link | None:
         """Return the link that already reaches `shard`, perhaps at another of its addresses."""
@@ -351,7 +351,7 @@ class ZenohCarrier:
         """Call `returned` with the name of each shard that comes (back) within reach."""
         self._returned = returned
 
-    def _tell_returned(self, shard: str) -> None:
+    def _report_return(self, shard: str) -> None:
         if not self._closed:
             self._returned(shard)
 

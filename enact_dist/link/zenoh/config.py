@@ -65,7 +65,7 @@ UNACKNOWLEDGED: Final = 0.75
 """How much of a link's lease a shard's bytes may stay unacknowledged: less than all of it, so
 that the kernel gives up before anything closes the link.
 """
-ANYBODY: Final = "anybody"
+ALL_PEERS: Final = "all-peers"
 EARLIER_QUESTION: Final = "await_stamp"
 """Discovery query of releases with frames before 7: the answer names our version."""
 ACCEPT_PENDING: Final = 10_000
@@ -178,8 +178,8 @@ def access_rules(cell: str, shard: str) -> dict[str, object]:
         "enabled": True,
         "default_permission": "deny",
         "rules": rules,
-        "subjects": [{"id": ANYBODY}],
-        "policies": [{"rules": [rule["id"] for rule in rules], "subjects": [ANYBODY]}],
+        "subjects": [{"id": ALL_PEERS}],
+        "policies": [{"rules": [rule["id"] for rule in rules], "subjects": [ALL_PEERS]}],
     }
 
 

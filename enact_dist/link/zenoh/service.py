@@ -67,7 +67,7 @@ DRAIN_STEP_S: Final = 0.001
 """How long a tick waits for a query that was just taken from the channel."""
 OVERHEAD_BYTES: Final = 1024
 """Overhead that each waiting query adds to the size of its data."""
-TOLD_MAX: Final = 1_000
+LOGGED_MAX: Final = 1_000
 """Number of clients with dropped requests that the log names, each once."""
 SHOWN_CHARACTERS: Final = 200
 """Logged length of a client's name."""
@@ -98,7 +98,7 @@ class ZenohService:
         self._tokens = session.liveliness().declare_subscriber(
             token_key(cell, ANY, ANY), zenoh.handlers.FifoChannel(QUEUED_MAX), history=True
         )
-        self._sights: zenoh.Handler[zenoh.Sample] = self._tokens.handler
+        self._token_events: zenoh.Handler[zenoh.Sample] = self._tokens.handler
         self._queryable = session.declare_queryable(
             queryable_key(cell, host.name), zenoh.handlers.FifoChannel(QUEUED_MAX), complete=True
         )
@@ -106,7 +106,7 @@ class ZenohService:
         # and afterwards have no handler for a thread that starts late.
         self._inbox: zenoh.Handler[zenoh.Query] = self._queryable.handler
         self._turns = Turns[_Arrived]()
-        self._told: set[str] = set()
+        self._logged: set[str] = set()
         self._resting = True
         self._drained: threading.Event | None = None
         self._marked: threading.Event | None = None
@@ -120,7 +120,7 @@ class ZenohService:
             for name, run in (
                 ("enact-dispatch", self._dispatch),
                 ("enact-stage", self._stage),
-                ("enact-tokens", self._see),
+                ("enact-tokens", self._watch_tokens),
             )
         ]
         for thread in self._threads:
@@ -195,8 +195,8 @@ class ZenohService:
         """Count a request that did not fit; log each client once."""
         self._host.count("requests_dropped")
         client = client[:SHOWN_CHARACTERS]
-        if client not in self._told and len(self._told) < TOLD_MAX:
-            self._told.add(client)
+        if client not in self._logged and len(self._logged) < LOGGED_MAX:
+            self._logged.add(client)
             _log.warning(
                 "shard %s: too many requests from %s, or from all clients, are waiting; some were"
                 " dropped, and further ones are only counted",
@@ -300,11 +300,11 @@ class ZenohService:
         self.senders.heard(_NOTICES)
         self.senders.send(_NOTICES, _Publication(self._publisher, *encode_frame(notice)))
 
-    def _see(self) -> None:
+    def _watch_tokens(self) -> None:
         """Report sessions' tokens to the host, until the subscription ends."""
         try:
             while True:
-                sample = self._sights.recv()
+                sample = self._token_events.recv()
                 identity, session = token_of(str(sample.key_expr))
                 if session:
                     present = sample.kind == zenoh.SampleKind.PUT
