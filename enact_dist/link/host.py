@@ -178,7 +178,7 @@ class ShardHost:
         self._failure: Exception | None = None
         self._ended = False
         self._draining = False
-        self._hurried = False
+        self._stops_now = False
         self._rests = threading.Event()
         self._wake = threading.Condition(threading.Lock())
         self._look_again = False
@@ -473,13 +473,13 @@ class ShardHost:
         """Wait until a drained shard may stop without costing a client its lock or commit.
 
         Returns:
-            True once it may stop or has failed; False after `timeout_s` and after `hurry`.
+            True once it may stop or has failed; False after `timeout_s` and after `stop_now`.
         """
-        return self._rests.wait(timeout_s) and not self._hurried
+        return self._rests.wait(timeout_s) and not self._stops_now
 
-    def hurry(self) -> None:
+    def stop_now(self) -> None:
         """End `wait_idle`."""
-        self._hurried = True
+        self._stops_now = True
         self._rests.set()
 
     def close(self) -> None:

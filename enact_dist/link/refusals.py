@@ -111,7 +111,7 @@ def not_granted(
         why = "the shard grants nothing yet: it restarted and waits for older leases to end"
     remedy = "raise wait_s, or hold the lock for less time"
     if not any(ACCESSES[item.access].locks for item in asked):  # a view: it has no wait_s
-        remedy = "try again, or raise patience_s of connect(…)"
+        remedy = "try again, or raise request_timeout_s of connect(…)"
     return LockTimeoutError(
         f"waited {waited_s:.1f} s for {wanted}; {why}; {remedy}",
         holders=holders,

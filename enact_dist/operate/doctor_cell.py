@@ -92,7 +92,7 @@ def differences(
     yield from _catalogue(config, welcomes)
 
 
-def namesakes(
+def duplicate_daemons(
     cell: str, config: CellConfig | None, welcomes: Mapping[str, Welcome]
 ) -> Iterator[Finding]:
     """Name the shards that several daemons serve, at any endpoint known of them.
@@ -104,7 +104,7 @@ def namesakes(
 
     Each shard is asked, too, at which further places others have named it.
     """
-    from enact_dist.link.client.namesakes import expected_places, serving, two_daemons
+    from enact_dist.link.client.duplicate_daemons import expected_places, serving, two_daemons
 
     entries = [entry for welcome in welcomes.values() for entry in welcome.placement.shards]
     if config is not None:

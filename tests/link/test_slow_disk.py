@@ -78,10 +78,10 @@ def test_shard_whose_disk_stands_still_is_not_taken_for_dead(
                 connect(endpoint, timeout_s=next(longer_s))
 
         def registers():
-            patience_s = next(longer_s)
+            request_timeout_s = next(longer_s)
             with pytest.raises(ShardUnreachableError, match=r"it runs.*its disk") as caught:
-                cell._client.greet(timeout_s=patience_s)
-                cell._client.register(worlds=("another",), timeout_s=patience_s)
+                cell._client.greet(timeout_s=request_timeout_s)
+                cell._client.register(worlds=("another",), timeout_s=request_timeout_s)
             assert caught.value.shard == "s0"
 
         # On a machine that stands still for as long, nobody has said anything in time.

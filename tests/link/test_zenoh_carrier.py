@@ -255,7 +255,7 @@ def test_carrier_tells_when_a_shard_comes_into_reach_again(daemon, carry, endpoi
     running = daemon(endpoint)
     carrier = carry(endpoint)
     came = queue.Queue()
-    carrier.tell_returns(came.put)
+    carrier.on_reconnect(came.put)
     carrier.add_endpoints([ShardEntry("s0", (endpoint,))])
     assert came.get(timeout=30) == "s0"
 
@@ -277,7 +277,7 @@ def test_shard_whose_watch_could_not_begin_is_watched_when_it_is_added_again(
     """There was no thread for it; its link stays."""
     daemon(endpoint)
     carrier, came = carry(endpoint), queue.Queue()
-    carrier.tell_returns(came.put)
+    carrier.on_reconnect(came.put)
 
     def refused(*_):
         raise RuntimeError("can't start new thread")

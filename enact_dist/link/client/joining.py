@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.messages import Welcome
 from enact_dist.errors import LinkError
+from enact_dist.link.client.duplicate_daemons import Doubts
 from enact_dist.link.client.locks import CellClient
-from enact_dist.link.client.namesakes import Doubts
 from enact_dist.link.socket.carrier import SocketCarrier
 from enact_dist.link.zenoh.carrier import ZenohCarrier
 from enact_dist.link.zenoh.config import OPEN_S

@@ -61,7 +61,7 @@ _log = logging.getLogger("enact.link")
 class Sender(Protocol):
     """What a transfer needs of the session that makes it."""
 
-    patience_s: float
+    request_timeout_s: float
 
     @property
     def staged_numbers(self) -> Iterator[int]:
@@ -269,10 +269,11 @@ class Transfer:
             if piece is None:
                 return
             self._bytes += piece.size
-            begun = self._client.begin(piece.shard, piece.request, timeout_s=self._patience_s())
+            timeout_s = self._answer_timeout_s()
+            begun = self._client.begin(piece.shard, piece.request, timeout_s=timeout_s)
             self._under_way.append((piece, begun))
 
-    def _patience_s(self) -> float:
+    def _answer_timeout_s(self) -> float:
         """Return how long the answer to a slice may take behind all that is in flight."""
         rate = BYTES_PER_S_MIN
         if self._received:
@@ -298,7 +299,7 @@ class Transfer:
     def _recover(self, shard: str) -> None:
         """Wait a little before repeating slices, unless the transfer has to end."""
         silent_s = time.monotonic() - self._heard_s
-        if silent_s >= self._client.patience_s:
+        if silent_s >= self._client.request_timeout_s:
             raise unreachable(shard, silent_s, self._client.carrier.endpoint_of)
         self._alive()
         self._client.rest(self._pause_s)

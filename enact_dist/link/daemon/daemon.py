@@ -23,7 +23,7 @@ from enact_dist.core.protocol.messages import ListLocks, Locks
 from enact_dist.core.protocol.records import Called, ShardReturned
 from enact_dist.errors import ConfigError, EnactError, LinkError
 from enact_dist.link.client.calls import Calls
-from enact_dist.link.client.namesakes import (
+from enact_dist.link.client.duplicate_daemons import (
     Comparing,
     expected_places,
     moved_places,
@@ -183,9 +183,9 @@ class RunningShard:
                 self._shared.close()
             self._ended.set()
 
-    def hurry(self) -> None:
+    def stop_now(self) -> None:
         """End the wait of a drain."""
-        self.host.hurry()
+        self.host.stop_now()
 
     def _name_holders(self, drain_s: float) -> None:
         held = []
@@ -308,7 +308,7 @@ def run_shard(settings: DaemonSettings) -> int:
             return 1
         try:
             signals.call(lambda word: _stop(shard, word, manager))
-            signals.call_again(lambda _: shard.hurry())
+            signals.call_again(lambda _: shard.stop_now())
             shard.host.each_tick(lambda: manager.alive(shard.host.state))
             _say_ready(shard, formatter)
             manager.ready(shard.host.state)

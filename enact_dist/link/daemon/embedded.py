@@ -135,7 +135,7 @@ class EmbeddedCarrier:
     def add_endpoints(self, entries: Sequence[ShardEntry]) -> None:
         """Do nothing: there is no other shard."""
 
-    def way_to(self, shard: str) -> str:
+    def transport_of(self, shard: str) -> str:
         """Return the transport, for people: calls stay inside this process."""
         return "call"
 
@@ -143,7 +143,7 @@ class EmbeddedCarrier:
         """Return False: the shard is in this process."""
         return False
 
-    def tell_returns(self, returned: Callable[[str], None]) -> None:
+    def on_reconnect(self, returned: Callable[[str], None]) -> None:
         """Do nothing: the shard is within reach while this process lives."""
 
     def endpoint_of(self, shard: str) -> str:

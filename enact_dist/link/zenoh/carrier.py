@@ -338,7 +338,7 @@ class ZenohCarrier:
             self._check_usable()
         return link
 
-    def way_to(self, shard: str) -> str:
+    def transport_of(self, shard: str) -> str:
         """Return the transport, for people."""
         return "zenoh"
 
@@ -347,7 +347,7 @@ class ZenohCarrier:
         presence = self._presences.get(shard)
         return presence is not None and not presence.here
 
-    def tell_returns(self, returned: Callable[[str], None]) -> None:
+    def on_reconnect(self, returned: Callable[[str], None]) -> None:
         """Call `returned` with the name of each shard that comes (back) within reach."""
         self._returned = returned
 
