@@ -122,7 +122,7 @@ def await_stamp(
         shard: The shard that is asked.
         stamp_ns: The stamp to wait for.
         wait_s: How long the shard may wait for it, at most one slice.
-        timeout_s: How long to wait for an answer of the shard (None: `patience_s`).
+        timeout_s: How long to wait for an answer of the shard (None: `request_timeout_s`).
 
     Raises:
         ShardUnreachableError: The shard does not answer.

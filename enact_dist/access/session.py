@@ -134,8 +134,9 @@ class Session:
         entries, written = self._entries_of(requests)
         if self.client.knows(entries):
             return prepared
-        patience_s = self.client.patience_s
-        timeout_s = patience_s if wait_s is None else min(patience_s, max(wait_s, CALL_S))
+        timeout_s = self.client.request_timeout_s
+        if wait_s is not None:
+            timeout_s = min(timeout_s, max(wait_s, CALL_S))
         if written:
             writing = [request for request in requests if request.access.writes]
             self.client.register(
@@ -187,7 +188,7 @@ class Session:
 
         Args:
             aspects: The aspects.
-            timeout_s: How long shards have to answer; None: as long as this client has patience.
+            timeout_s: How long shards have to answer; None: `request_timeout_s`.
 
         Raises:
             DatumTypeError: A shard knows one with another type.

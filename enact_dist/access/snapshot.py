@@ -218,7 +218,7 @@ def take_readings(
 ) -> Readings:
     """Take one view, as of a stamp if one is given, and fetch what is large of its `data`."""
     client = session.client
-    lock = client.acquire(items, wait_s=client.patience_s, hold_s=VIEW_S, past_ns=past_ns)
+    lock = client.acquire(items, wait_s=client.request_timeout_s, hold_s=VIEW_S, past_ns=past_ns)
     try:
         readings = Readings(client, session.cache, lock.lock, lock.states, lambda: None)
         if data:
@@ -246,15 +246,17 @@ class HeldView(Closing):
 
     Raises:
         ForgottenError: A state as of `past_ns` has left its retention.
-        LockTimeoutError: No consistent view came within `patience_s`, or a commit with an earlier
-            timestamp is still undecided.
+        LockTimeoutError: No consistent view came within `request_timeout_s`, or a commit with an
+            earlier timestamp is still undecided.
         ShardUnreachableError: A shard does not answer.
     """
 
     def __init__(self, session: Session, items: Iterable[Item], *, past_ns: int = 0) -> None:
         client = session.client
         self.session = session
-        self._lock = client.acquire(items, wait_s=client.patience_s, hold_s=VIEW_S, past_ns=past_ns)
+        self._lock = client.acquire(
+            items, wait_s=client.request_timeout_s, hold_s=VIEW_S, past_ns=past_ns
+        )
         self.states: tuple[Reading, ...] = tuple(self._lock.states)
         self.locks = bool(self._lock.parts)
 

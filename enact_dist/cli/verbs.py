@@ -355,7 +355,7 @@ def open_cell(arguments: argparse.Namespace, *, observer: bool = True, actor: st
         cell_target(arguments),
         actor=actor or "enact",
         timeout_s=timeout_s,
-        patience_s=timeout_s,
+        request_timeout_s=timeout_s,
         observer=observer,
     )
 

@@ -60,7 +60,7 @@ class SideView(HeldView):
 
     Raises:
         ForgottenError: The past data are no longer known.
-        LockTimeoutError: No consistent view came within `patience_s`.
+        LockTimeoutError: No consistent view came within `request_timeout_s`.
         MisuseError: The requests exceed what one view can hold.
         UnknownWorldError: The cell no longer has one of them; checked if patterns show nothing.
         ShardUnreachableError: A shard does not answer.

@@ -165,16 +165,16 @@ class Carrier(Protocol):
             MisuseError: As `request`.
         """
 
-    def way_to(self, shard: str) -> str:
+    def transport_of(self, shard: str) -> str:
         """Return how calls to a shard travel now, for people: "zenoh", "socket", …."""
 
     def away(self, shard: str) -> bool:
         """Whether a shard is known to be out of reach; contacts no shard.
 
-        When it comes back, the callback given to `tell_returns` is called.
+        When it comes back, the callback given to `on_reconnect` is called.
         """
 
-    def tell_returns(self, returned: Callable[[str], None]) -> None:
+    def on_reconnect(self, returned: Callable[[str], None]) -> None:
         """Call `returned` with the name of each shard that comes (back) within reach.
 
         The call comes from any thread and must not block.  It is a hint: some carriers never call.

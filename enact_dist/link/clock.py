@@ -17,22 +17,15 @@ import time
 from functools import partial
 from typing import Protocol
 
-
-def monotonic_ns() -> int:
-    """Return the time since an arbitrary start that stops during suspend."""
-    return time.monotonic_ns()
-
-
+monotonic_ns = time.monotonic_ns
+"""Return the time since an arbitrary start that stops during suspend."""
+wall_ns = time.time_ns
+"""Return the time since 1970-01-01 UTC by this host's clock."""
 if hasattr(time, "CLOCK_BOOTTIME"):
     boottime_ns = partial(time.clock_gettime_ns, time.CLOCK_BOOTTIME)
     """Return the time since boot, suspend included (Linux; elsewhere `monotonic_ns`)."""
 else:
     boottime_ns = partial(time.monotonic_ns)
-
-
-def wall_ns() -> int:
-    """Return the time since 1970-01-01 UTC by this host's clock."""
-    return time.time_ns()
 
 
 class Clock(Protocol):
@@ -50,7 +43,5 @@ class SystemClock:
 
     __slots__ = ()
 
-    monotonic_ns = staticmethod(time.monotonic_ns)
-    """Return this host's monotonic time."""
-    wall_ns = staticmethod(time.time_ns)
-    """Return this host's wall clock, since 1970."""
+    monotonic_ns = staticmethod(monotonic_ns)
+    wall_ns = staticmethod(wall_ns)

@@ -58,9 +58,9 @@ from enact_dist.core.state.catalogue import REMEDY
 from enact_dist.core.state.clock import state_of, unkept_epoch
 from enact_dist.errors import StoreError
 from enact_dist.link.clock import Clock, SystemClock
-from enact_dist.link.host_figures import figures_of, latencies_of
-from enact_dist.link.host_guards import Stalls, Uninterrupted
+from enact_dist.link.host_figures import Stalls, figures_of, latencies_of
 from enact_dist.link.memory.payload_desk import PayloadDesk, half_of, names_payloads
+from enact_dist.link.signals import Uninterrupted
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -178,7 +178,7 @@ class ShardHost:
         self._failure: Exception | None = None
         self._ended = False
         self._draining = False
-        self._hurried = False
+        self._stops_now = False
         self._rests = threading.Event()
         self._wake = threading.Condition(threading.Lock())
         self._look_again = False
@@ -473,13 +473,13 @@ class ShardHost:
         """Wait until a drained shard may stop without costing a client its lock or commit.
 
         Returns:
-            True once it may stop or has failed; False after `timeout_s` and after `hurry`.
+            True once it may stop or has failed; False after `timeout_s` and after `stop_now`.
         """
-        return self._rests.wait(timeout_s) and not self._hurried
+        return self._rests.wait(timeout_s) and not self._stops_now
 
-    def hurry(self) -> None:
+    def stop_now(self) -> None:
         """End `wait_idle`."""
-        self._hurried = True
+        self._stops_now = True
         self._rests.set()
 
     def close(self) -> None:

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import re
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.client.lock import MultiLock
 from enact_dist.core.client.plan import Phase
-from enact_dist.core.protocol.messages import Forgotten
+from enact_dist.core.protocol.messages import Forgotten, Refused
 from enact_dist.core.shard.owners import PERMISSION
 from enact_dist.core.state.grants import HELD_TOO_LONG
 from enact_dist.errors import (
@@ -37,7 +37,22 @@ from enact_dist.terms import ACCESSES
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from enact_dist.core.protocol.messages import Holder, Item, Refused
+    from enact_dist.core.protocol.messages import Answer, Holder, Item
+
+
+_CLASSES: Final[dict[str, type[EnactError]]] = {
+    "datum_type": DatumTypeError,
+    "unknown_aspect": MisuseError,
+    "value": MisuseError,
+    "held": MisuseError,
+    "protocol": ProtocolError,
+    "too_long": MisuseError,
+    "overload": LinkError,
+    "no_room": NoRoomError,
+    PERMISSION: PermissionDeniedError,
+    "damaged": StoreError,
+}
+"""The exception of each code of a refusal; any other code is a `LinkError`."""
 
 
 def unreachable(
@@ -96,7 +111,7 @@ def not_granted(
         why = "the shard grants nothing yet: it restarted and waits for older leases to end"
     remedy = "raise wait_s, or hold the lock for less time"
     if not any(ACCESSES[item.access].locks for item in asked):  # a view: it has no wait_s
-        remedy = "try again, or raise patience_s of connect(…)"
+        remedy = "try again, or raise request_timeout_s of connect(…)"
     return LockTimeoutError(
         f"waited {waited_s:.1f} s for {wanted}; {why}; {remedy}",
         holders=holders,
@@ -199,16 +214,11 @@ def error_of(refused: Refused | Forgotten) -> EnactError:
     if refused.code == "clock_skew":
         ahead = re.search(r"(\d+\.\d+) s ahead", refused.text)
         return ClockSkewError(refused.text, ahead_s=float(ahead[1]) if ahead else 0.0)
-    classes: dict[str, type[EnactError]] = {
-        "datum_type": DatumTypeError,
-        "unknown_aspect": MisuseError,
-        "value": MisuseError,
-        "held": MisuseError,
-        "protocol": ProtocolError,
-        "too_long": MisuseError,
-        "overload": LinkError,
-        "no_room": NoRoomError,
-        PERMISSION: PermissionDeniedError,
-        "damaged": StoreError,
-    }
-    return classes.get(refused.code, LinkError)(refused.text)
+    return _CLASSES.get(refused.code, LinkError)(refused.text)
+
+
+def error_for(answer: Answer, question: str) -> EnactError:
+    """Return the exception for an answer that does not fit its question."""
+    if isinstance(answer, Refused | Forgotten):
+        return error_of(answer)
+    return ProtocolError(f"{question} was answered with a {type(answer).__name__}")

@@ -213,7 +213,7 @@ def _cell(
     target: str, config: CellConfig | None, timeout_s: float
 ) -> Generator[Finding, None, frozenset[str]]:
     """Check the cell; return the names of the shards that keep data in a folder now."""
-    from enact_dist.operate.doctor_cell import differences, namesakes
+    from enact_dist.operate.doctor_cell import differences, duplicate_daemons
     from enact_dist.world.connecting import connect
 
     kept: frozenset[str] = frozenset()
@@ -224,7 +224,7 @@ def _cell(
             for shard in shards:
                 yield from _shard(shard)
             welcomes = cell.welcomes()
-            yield from namesakes(cell.name, config, welcomes)
+            yield from duplicate_daemons(cell.name, config, welcomes)
             yield from differences(config, shards, welcomes)
     except ShardUnreachableError as error:
         if config is None:

@@ -92,7 +92,7 @@ def differences(
     yield from _catalogue(config, welcomes)
 
 
-def namesakes(
+def duplicate_daemons(
     cell: str, config: CellConfig | None, welcomes: Mapping[str, Welcome]
 ) -> Iterator[Finding]:
     """Name the shards that several daemons serve, at any endpoint known of them.
@@ -104,12 +104,12 @@ def namesakes(
 
     Each shard is asked, too, at which further places others have named it.
     """
-    from enact_dist.link.client.namesakes import serving, told_places, two_daemons
+    from enact_dist.link.client.duplicate_daemons import expected_places, serving, two_daemons
 
     entries = [entry for welcome in welcomes.values() for entry in welcome.placement.shards]
     if config is not None:
         entries += config.placement_map().shards
-    for told in told_places(cell, list(dict.fromkeys(entries)), timeout_s=ASK_S):
+    for told in expected_places(cell, list(dict.fromkeys(entries)), timeout_s=ASK_S):
         entries += told
     places: dict[str, dict[str, None]] = {}
     for entry in entries:

@@ -421,7 +421,7 @@ class Cell(Closing):
         """Identity of this process's session, as `ActorInfo.session` names it."""
         return self._client.core.session
 
-    def namesakes(self, name: str) -> tuple[ActorInfo, ...]:
+    def sessions_named(self, name: str) -> tuple[ActorInfo, ...]:
         """Return the other sessions of actors of a name that are not silent.
 
         All shards are asked, because the other may be known to one of them alone; none is waited

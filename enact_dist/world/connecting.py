@@ -34,7 +34,7 @@ def connect(
     *,
     actor: str = "",
     timeout_s: float = 5.0,
-    patience_s: float = 10.0,
+    request_timeout_s: float = 10.0,
     observer: bool = False,
 ) -> Cell:
     """Join a running cell.
@@ -44,9 +44,9 @@ def connect(
             shard knows the others.
         actor: Name under which `enact lock ls` and `enact actor ls` show this process.
         timeout_s: How long to wait for a first shard to answer.
-        patience_s: How long a question waits for a shard that does not answer, before it counts as
-            unreachable; locks bring a time of their own, and a commit takes as long as it takes to
-            know its end.
+        request_timeout_s: How long a request waits for a shard that does not answer before the
+            shard counts as unreachable.  Locks have a time limit of their own, and a commit takes
+            as long as it takes to learn its outcome.
         observer: Only look: no lock can be taken, no world context or aspect comes to be, and a
             shard keeps no record of the session.
 
@@ -60,7 +60,7 @@ def connect(
     from enact_dist.link.client.joining import join
     from enact_dist.link.zenoh.config import OPEN_S
 
-    for word, waits_s in (("timeout_s", timeout_s), ("patience_s", patience_s)):
+    for word, waits_s in (("timeout_s", timeout_s), ("request_timeout_s", request_timeout_s)):
         check_seconds(word, waits_s)
     name, ttl_s = "", TTL_S
     carrier = carrier_of(os.environ)
@@ -80,11 +80,11 @@ def connect(
         endpoints,
         client,
         timeout_s=timeout_s,
-        open_s=min(OPEN_S, patience_s),
+        open_s=min(OPEN_S, request_timeout_s),
         carrier=carrier,
         expected=expected,
     )
-    cell_client.patience_s = patience_s
+    cell_client.request_timeout_s = request_timeout_s
     try:
         cell_client.start(welcome)
     except BaseException:

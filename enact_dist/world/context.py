@@ -90,7 +90,7 @@ class WorldContext(CellContext):
 
         Raises:
             LockHeldError: This thread holds a lock; name the views in it instead.
-            LockTimeoutError: No consistent view came within `patience_s`: shards keep
+            LockTimeoutError: No consistent view came within `request_timeout_s`: shards keep
                 restarting, or data that are written all the time stay locked for long.
             MisuseError: A request locks.
             NullDatumError: The `Together` has no complete set.

@@ -318,6 +318,6 @@ def _asked_info(client: CellClient, shard: str) -> ShardInfo:
         locks=sum(session.locks for session in answer.sessions),
         clock_ahead_s=ahead_ns / 1e9,
         round_trip_s=round_trip_s,
-        carrier=client.carrier.way_to(shard),
+        carrier=client.carrier.transport_of(shard),
         counters={counter.name: counter.value for counter in answer.counters},
     )

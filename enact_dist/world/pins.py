@@ -79,6 +79,6 @@ def _set_pins(session: Session, label: str, by_shard: dict[str, list[SlotVersion
     answers = []
     for shard, answer in client.ask_each(sorted(by_shard), request_of).items():
         if answer is None:
-            raise client.unreachable(shard, client.patience_s)
+            raise client.unreachable(shard, client.request_timeout_s)
         answers.append(expected(Kept, KeepVersions, answer))
     return answers

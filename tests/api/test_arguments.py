@@ -108,7 +108,7 @@ SECONDS = {
     "hold_s": lambda world, wrong: Lock(Write(world, robot, PLAN), hold_s=wrong),
     "timeout_s of a watch": lambda world, wrong: world.watch("**").next(wrong),
     "timeout_s of connect": lambda _, wrong: connect("tcp/127.0.0.1:1", timeout_s=wrong),
-    "patience_s": lambda _, wrong: connect("tcp/127.0.0.1:1", patience_s=wrong),
+    "request_timeout_s": lambda _, wrong: connect("tcp/127.0.0.1:1", request_timeout_s=wrong),
 }
 
 

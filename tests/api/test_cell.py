@@ -266,7 +266,7 @@ def test_connect_names_the_endpoint_when_nobody_listens():
         connect("tcp/127.0.0.1:9", timeout_s=0.2)
 
 
-@pytest.mark.parametrize("word", ["timeout_s", "patience_s"])
+@pytest.mark.parametrize("word", ["timeout_s", "request_timeout_s"])
 @pytest.mark.parametrize("waits_s", [-1.0, float("nan")])
 def test_connect_refuses_what_is_no_time(word, waits_s):
     """Before anything is asked: a wait that is no number would never end, or at once."""

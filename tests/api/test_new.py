@@ -348,7 +348,7 @@ def test_last_write_of_a_block_counts(online):
         lock[write] = np.full(100_000, 3, np.uint8)
     with Lock(read) as lock:
         assert np.array_equal(lock[read], np.full(100_000, 3, np.uint8))
-    assert come_down_to(0 if online.session.client.carrier.way_to("local") == "call" else 1)
+    assert come_down_to(0 if online.session.client.carrier.transport_of("local") == "call" else 1)
 
     with Lock(write) as lock:
         lock.new(write, (200_000,), np.uint8)[:] = 1
@@ -380,7 +380,7 @@ def test_second_new_of_a_block_is_refused(online, size):
         lock.new(write, (6,), np.uint8)[:] = 6
     with Lock(read) as lock:
         assert lock[read].tolist() == [6] * 6
-    shared = size > 1000 and online.session.client.carrier.way_to("local") != "call"
+    shared = size > 1000 and online.session.client.carrier.transport_of("local") != "call"
     assert come_down_to(1 if shared else 0)  # what was committed and replaced
 
 

@@ -178,7 +178,7 @@ def test_view_that_finds_no_moment_waits_for_locks_and_says_who_holds_them(two_s
     held, done = threading.Event(), threading.Event()
     monkeypatch.setattr("enact_dist.core.client.lock.ROUNDS_MAX", 0)
     monkeypatch.setattr("enact_dist.core.client.cut.Cut.settled", lambda *_, **__: None)
-    monkeypatch.setattr(cell._client, "patience_s", 1.0)
+    monkeypatch.setattr(cell._client, "request_timeout_s", 1.0)
 
     def hold() -> None:
         with Lock(Write(online, left, SPEED)):
@@ -194,7 +194,7 @@ def test_view_that_finds_no_moment_waits_for_locks_and_says_who_holds_them(two_s
     finally:
         done.set()
         holder.join()
-    assert str(told.value).endswith("try again, or raise patience_s of connect(…)")
+    assert str(told.value).endswith("try again, or raise request_timeout_s of connect(…)")
     assert len(told.value.holders) == 1
 
 

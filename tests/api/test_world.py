@@ -148,7 +148,7 @@ def test_view_of_small_data_costs_one_round_trip(cell, online):
     asked.clear()
     for _ in range(2):
         online.view(View(online, piece, CLOUD))
-    shared = carrier.way_to("local") != "call"  # then the view names a file
+    shared = carrier.transport_of("local") != "call"  # then the view names a file
     assert asked == [TakeView, *([] if shared else [Fetch]), Release, TakeView, Release]
 
 

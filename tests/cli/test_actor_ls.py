@@ -12,7 +12,7 @@ import pytest
 
 from enact_dist.actor.report import ActorStatistics
 from enact_dist.cli.actor.actor import _losses
-from enact_dist.cli.actor.run import _warn_of_namesakes
+from enact_dist.cli.actor.run import _warn_of_same_name
 from enact_dist.world.listings import ActorInfo
 
 MODULE = """\
@@ -146,9 +146,9 @@ def test_two_actors_of_one_name_are_told_of(start, until, enact, cell_file):
 def test_predecessor_that_is_gone_is_no_namesake(caplog):
     """Its session lasts a lease longer; of another host nobody can know."""
     gone = ActorInfo("twin", socket.gethostname(), (1 << 22) + 1, "s1", ("left",), 0.5, 0)
-    cell = SimpleNamespace(namesakes=lambda _: (gone, replace(gone, host=f"not-{gone.host}")))
+    cell = SimpleNamespace(sessions_named=lambda _: (gone, replace(gone, host=f"not-{gone.host}")))
 
-    _warn_of_namesakes(cell, "twin")
+    _warn_of_same_name(cell, "twin")
 
     (said,) = caplog.messages
     assert said.startswith(f"another actor named twin runs, process {gone.pid} on not-")

@@ -76,10 +76,10 @@ def run(cell):
     say("view", online.view(view)[view])
 
 
-with connect(sys.argv[1], patience_s=60.0) as cell:
+with connect(sys.argv[1], request_timeout_s=60.0) as cell:
     if sys.argv[2:] == ["pause"]:
         pause_in_the_midst(cell)
     run(cell)
-    ways = sorted(cell._client.carrier.way_to(shard).split()[0] for shard in ("s0", "s1"))
+    ways = sorted(cell._client.carrier.transport_of(shard).split()[0] for shard in ("s0", "s1"))
     print(f"repeated: {cell.statistics().get('slices_repeated', 0)}", flush=True)
     print(f"done: {' '.join(ways)}", flush=True)

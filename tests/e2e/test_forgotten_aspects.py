@@ -25,7 +25,7 @@ def fall_silent(cell, monkeypatch):
     """Let a connection say and hear nothing by itself: it learns of a restart when it is used."""
     monkeypatch.setattr(cell._client, "renew_once", lambda: None)
     monkeypatch.setattr(cell._client, "_shard_returned", lambda _: None)
-    cell._client.carrier.tell_returns(lambda _: None)
+    cell._client.carrier.on_reconnect(lambda _: None)
 
 
 def restart(cell, *forgets):

@@ -102,11 +102,11 @@ def test_missing_shard_is_an_error_that_names_shard_and_endpoint(make_cell):
     from enact_dist.errors import ShardUnreachableError
 
     cell = make_cell(shards=("s0", "s1")).start_all()
-    with connect(cell.file, patience_s=1.0) as joined:
+    with connect(cell.file, request_timeout_s=1.0) as joined:
         online = joined.world("online")
         cell.kill("s1")
         with pytest.raises(ShardUnreachableError, match=rf"s1 at tcp/127.0.0.1:{cell.ports['s1']}"):
             online.list_slots()
-        joined._client.patience_s = 10.0
+        joined._client.request_timeout_s = 10.0
         states = {shard.name: shard.reachable for shard in joined.shards()}
         assert states == {"s0": True, "s1": False}

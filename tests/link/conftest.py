@@ -185,7 +185,7 @@ def carry(request):
             hello = Hello(session, 0, int(TTL_S * 1e9), "tester", "host", os.getpid(), True)
             while carrier.request("s0", hello, timeout_s=1) is None:
                 assert carrier.calls["zenoh"] < 100
-            assert carrier.way_to("s0") == "socket"
+            assert carrier.transport_of("s0") == "socket"
         return carrier
 
     yield open_carrier

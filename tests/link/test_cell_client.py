@@ -124,7 +124,7 @@ def test_way_to_a_shard_is_that_of_the_next_lock_on_it(two, until):
     two.start("a")
     with two.connect(observer=True) as cell:
         assert [shard.reachable for shard in cell.shards()] == [True, False]
-        untold = cell._client.carrier.way_to("b")
+        untold = cell._client.carrier.transport_of("b")
         two.start("b")
 
         assert untold == "zenoh (the shard has not welcomed us yet)"

@@ -15,8 +15,8 @@ from enact_dist.link.memory import payload_desk
 from enact_dist.link.refusals import error_of
 from enact_dist.link.socket import service as socket_service
 from enact_dist.link.socket.frames import Kind
-from enact_dist.link.zenoh.carrier import wait_connected
 from enact_dist.link.zenoh.config import MESSAGE_BYTES_MAX, close_session, open_session
+from enact_dist.link.zenoh.queries import wait_connected
 from enact_dist.wire.frames import decode_frame, encode_frame
 from enact_dist.wire.keys import request_key, verb_of
 from enact_dist.wire.limits import COMMIT_BYTES_MAX, FRAME_BYTES_MAX
@@ -109,7 +109,7 @@ def test_message_on_the_key_of_another_verb_is_refused(daemon, endpoint, strange
     answer = stranger(m.ListLocks(), "eve@h:1", verb="survey")
 
     assert isinstance(answer, m.Refused)
-    assert answer.text == "a list_locks came on the key of a survey"
+    assert answer.text == "a list_locks arrived on the key of a survey"
     assert shard.host._shard.counters["frames_refused"] == 1
 
 

@@ -132,7 +132,7 @@ def test_session_whose_watch_looks_for_missed_notices_gives_four(session, carrie
 def test_first_lock_ends_a_long_rest_and_the_next_ones_wake_nobody(session, monkeypatch):
     """A renewal that came later than a quarter of a TTL would be one chance less for the lock."""
     hurries = []
-    monkeypatch.setattr(session.pauses, "hurry", lambda: hurries.append(1))
+    monkeypatch.setattr(session.pauses, "end_long_pause", lambda: hurries.append(1))
     assert session.next_renewal_s() == TTL_NS / 2e9
     for _ in range(3):
         session.release(session.acquire([WRITE], wait_s=0.0, hold_s=1.0))
@@ -158,7 +158,7 @@ def test_hurried_renewal_only_looks_how_long_it_may_rest():
 
     here = Renewed()
     renewing = threading.Thread(target=keep_renewing, args=(weakref.ref(here), pauses))
-    pauses.hurry()
+    pauses.end_long_pause()
     renewing.start()
     renewing.join(30)
 

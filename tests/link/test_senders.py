@@ -6,12 +6,12 @@ from collections import Counter
 import pytest
 
 from enact_dist.core.protocol.messages import Registered
-from enact_dist.link.zenoh import senders as module
-from enact_dist.link.zenoh.senders import (
+from enact_dist.link.answers import size_of
+from enact_dist.link.zenoh import fairness as module
+from enact_dist.link.zenoh.fairness import (
     OUTSTANDING_BYTES_MAX,
     QUEUED_ANSWERS_MAX,
     Senders,
-    size_of,
 )
 
 

@@ -88,15 +88,15 @@ def test_daemon_that_ends_before_its_threads_have_begun_ends_quietly(daemon, end
     go_on, ended = threading.Event(), threading.Event()
     failures = []
 
-    def begins_late(service, *, _see=ZenohService._see):
+    def begins_late(service, *, _watch_tokens=ZenohService._watch_tokens):
         assert go_on.wait(60)
         try:
-            _see(service)
+            _watch_tokens(service)
         except BaseException as failure:
             failures.append(failure)
         ended.set()
 
-    monkeypatch.setattr(ZenohService, "_see", begins_late)
+    monkeypatch.setattr(ZenohService, "_watch_tokens", begins_late)
     daemon(endpoint).stop()
     go_on.set()
 

@@ -7,7 +7,7 @@ from quiet_moments import ATTEMPTS, met_once
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
 from enact_dist.errors import CommitUnknownError, ShardUnreachableError
-from enact_dist.link import host_guards as stalls
+from enact_dist.link import host_figures as stalls
 from enact_dist.link.client import locks as client
 from enact_dist.link.client import session as session_client
 from enact_dist.link.store.store import Store
@@ -78,10 +78,10 @@ def test_shard_whose_disk_stands_still_is_not_taken_for_dead(
                 connect(endpoint, timeout_s=next(longer_s))
 
         def registers():
-            patience_s = next(longer_s)
+            request_timeout_s = next(longer_s)
             with pytest.raises(ShardUnreachableError, match=r"it runs.*its disk") as caught:
-                cell._client.greet(timeout_s=patience_s)
-                cell._client.register(worlds=("another",), timeout_s=patience_s)
+                cell._client.greet(timeout_s=request_timeout_s)
+                cell._client.register(worlds=("another",), timeout_s=request_timeout_s)
             assert caught.value.shard == "s0"
 
         # On a machine that stands still for as long, nobody has said anything in time.
@@ -111,7 +111,7 @@ def test_disk_that_stands_still_is_told_to_the_log(daemon, endpoint, tmp_path, d
 
     assert len(told) == 2, told
     assert "has written nothing for" in told[0]
-    assert "is back after" in told[1]
+    assert "writes again after" in told[1]
     assert shard.host._shard.counters["disk_stalls"] == 1
 
 
@@ -135,5 +135,5 @@ def test_shard_without_a_turn_is_told_to_the_log(caplog):
         watch.look(None, now_s)
 
     (told,) = (record.getMessage() for record in caplog.records)
-    assert "shard s0 had no turn for 11.8 s" in told
+    assert "shard s0 did not run for 11.8 s" in told
     assert counted == []

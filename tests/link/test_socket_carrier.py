@@ -39,7 +39,7 @@ def test_socket_is_taken_where_both_ends_share_the_folder(daemon, endpoint):
         add_one(cell)
         carrier = carrier_of(cell)
 
-        assert carrier.way_to("s0") == "socket"
+        assert carrier.transport_of("s0") == "socket"
         assert carrier.calls["zenoh"] == 0
         assert carrier.calls["socket"] >= 2
         assert [shard.carrier for shard in cell.shards()] == ["socket"]
@@ -74,7 +74,7 @@ def test_zenoh_is_taken_where_the_folder_is_not_shared(daemon, endpoint, monkeyp
         with Lock(request) as lock:
             assert lock[request] == 1
 
-        assert "not shared with this process" in carrier_of(cell).way_to("s0")
+        assert "not shared with this process" in carrier_of(cell).transport_of("s0")
         assert carrier_of(cell).calls["socket"] == 0
 
 
@@ -88,7 +88,7 @@ def test_zenoh_is_taken_where_the_folder_is_another_one(daemon, endpoint, shared
     with connect(endpoint) as cell:
         add_one(cell)
 
-        assert "nonces differ" in carrier_of(cell).way_to("s0")
+        assert "nonces differ" in carrier_of(cell).transport_of("s0")
 
 
 def test_socket_that_is_asked_for_and_impossible_is_an_error(
@@ -131,7 +131,7 @@ def test_forced_socket_of_a_shard_that_has_gone_since_its_welcome_is_no_error(
         add_one(cell)
         starting.join()
 
-        assert carrier_of(cell).way_to("s0") == "socket"
+        assert carrier_of(cell).transport_of("s0") == "socket"
         assert [shard.epoch for shard in cell.shards()] == [following[0].host.epoch]
 
 
@@ -170,7 +170,7 @@ def test_calls_go_on_over_zenoh_when_the_socket_is_gone(daemon, endpoint):
         with Lock(request) as lock:
             assert lock[request] == 6
 
-        assert carrier_of(cell).way_to("s0").startswith("zenoh")
+        assert carrier_of(cell).transport_of("s0").startswith("zenoh")
 
 
 def test_open_connections_outlive_the_file(daemon, endpoint):
@@ -204,7 +204,7 @@ def test_socket_is_taken_again_after_a_restart(daemon, endpoint, until):
 
         add_one(cell)
 
-        until(lambda: carrier_of(cell).way_to("s0") == "socket")
+        until(lambda: carrier_of(cell).transport_of("s0") == "socket")
         before = dict(carrier_of(cell).calls)
         add_one(cell)
         after = carrier_of(cell).calls

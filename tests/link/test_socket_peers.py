@@ -37,7 +37,7 @@ from enact_dist import Aspect, Durability, Entity, Lock, Write, connect
 cell = connect(sys.argv[1], actor="holder")
 request = Write(cell.world("online"), Entity("cup"), Aspect("count", int, Durability.VOLATILE))
 with Lock(request) as lock:
-    assert cell._client.carrier.way_to("s0") == sys.argv[2], cell._client.carrier.way_to("s0")
+    assert cell._client.carrier.transport_of("s0") == sys.argv[2], cell._client.carrier.transport_of("s0")
     exec(sys.argv[3])
     print("held", flush=True)
     sys.stdin.readline()

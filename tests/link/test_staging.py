@@ -30,7 +30,7 @@ class Way:
             endpoint_of=lambda shard: f"tcp/{shard}:1",
             request_all=lambda calls, **_: [self.desks[s].stage(m) for s, m in calls],
         )
-        self.patience_s = 10.0
+        self.request_timeout_s = 10.0
         self.staged_numbers = itertools.count(FIRST_STAGED)
         self.asked, self.counters, self.under_way = [], {}, 0
 
@@ -192,7 +192,7 @@ def test_lock_that_is_lost_ends_the_transfer_after_a_loss():
 def test_silent_shard_is_named():
     """No answer for too long is an error with the shard's endpoint."""
     way = Way()
-    way.patience_s = 0.0
+    way.request_timeout_s = 0.0
     way.carry = lambda *_: None
     with pytest.raises(ShardUnreachableError, match="tcp/s0:1"):
         stage(way, {"s0": [write_of("a", 100_000)]}, lambda: None)
@@ -203,7 +203,7 @@ def test_answer_that_does_not_fit_is_an_error(answer):
     """Neither a refusal nor the answer to something else passes for a slice that has come."""
     way = Way()
     way.carry = lambda *_: answer
-    with pytest.raises(EnactError, match=r"nonsense|Staged came"):
+    with pytest.raises(EnactError, match=r"nonsense|answered with a Staged"):
         stage(way, {"s0": [write_of("a", 100_000)]}, lambda: None)
 
 

@@ -29,7 +29,7 @@ class Way:
         self.carrier = SimpleNamespace(
             fetch_bytes=slice_bytes, endpoint_of=lambda shard: f"tcp/{shard}:1"
         )
-        self.patience_s = 10.0
+        self.request_timeout_s = 10.0
         self.asked, self.under_way, self.most_bytes = [], {}, 0
         self.rests, self.counters, self.abandoned = [], {}, 0
 
@@ -154,7 +154,7 @@ def test_reader_gives_up_when_a_shard_stays_silent():
     """No answer for too long names the shard, and pauses grow meanwhile."""
     slot, body = cloud("a", 10 * SLICE)
     way = Way({slot: body})
-    way.patience_s = 0.05
+    way.request_timeout_s = 0.05
     way.answer = lambda *_: None
 
     with pytest.raises(ShardUnreachableError, match="tcp/s0:1"):

@@ -2,8 +2,8 @@
 
 import pytest
 
-from enact_dist.link.zenoh import turns as module
-from enact_dist.link.zenoh.turns import Turns
+from enact_dist.link.zenoh import fairness as module
+from enact_dist.link.zenoh.fairness import Turns
 
 
 def filled(*sent):

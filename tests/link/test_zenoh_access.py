@@ -9,8 +9,13 @@ import pytest
 import zenoh
 
 from enact_dist.core.protocol import messages as m
-from enact_dist.link.zenoh.access import ACCEPT_PENDING, listening_settings
-from enact_dist.link.zenoh.config import close_session, open_session, session_config
+from enact_dist.link.zenoh.config import (
+    ACCEPT_PENDING,
+    close_session,
+    listening_settings,
+    open_session,
+    session_config,
+)
 from enact_dist.link.zenoh.discovery import find_shards
 from enact_dist.link.zenoh.endpoints import split_endpoint
 from enact_dist.wire.frames import decode_frame, encode_frame

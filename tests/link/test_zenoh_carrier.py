@@ -25,7 +25,6 @@ from enact_dist.errors import (
     ProtocolError,
     ShardUnreachableError,
 )
-from enact_dist.link.zenoh import bulk as zenoh_bulk
 from enact_dist.link.zenoh import carrier as zenoh_carrier
 from enact_dist.link.zenoh import config as zenoh_config
 from enact_dist.link.zenoh.config import close_session, open_session
@@ -256,7 +255,7 @@ def test_carrier_tells_when_a_shard_comes_into_reach_again(daemon, carry, endpoi
     running = daemon(endpoint)
     carrier = carry(endpoint)
     came = queue.Queue()
-    carrier.tell_returns(came.put)
+    carrier.on_reconnect(came.put)
     carrier.add_endpoints([ShardEntry("s0", (endpoint,))])
     assert came.get(timeout=30) == "s0"
 
@@ -278,7 +277,7 @@ def test_shard_whose_watch_could_not_begin_is_watched_when_it_is_added_again(
     """There was no thread for it; its link stays."""
     daemon(endpoint)
     carrier, came = carry(endpoint), queue.Queue()
-    carrier.tell_returns(came.put)
+    carrier.on_reconnect(came.put)
 
     def refused(*_):
         raise RuntimeError("can't start new thread")
@@ -403,10 +402,9 @@ def test_connection_for_large_data_is_awaited_no_longer_than_that_for_calls(
         waits_s.append(open_s)
         return open_session(open_s=open_s, **options)
 
-    for module in (zenoh_bulk, zenoh_carrier):
-        monkeypatch.setattr(module, "open_session", noted)
+    monkeypatch.setattr(zenoh_carrier, "open_session", noted)
     carrier = zenoh_carrier.ZenohCarrier("cell", "me", "me", [endpoint], ttl_s=2.0, open_s=1.5)
-    carrier._links[0].bulk.session()
+    carrier._links[0].bulk()
     carrier.close()
 
     assert waits_s == [1.5, 1.5]

@@ -11,7 +11,7 @@ import zenoh
 
 from enact_dist.link.zenoh.config import close_session, open_session
 from enact_dist.link.zenoh.events import Events
-from enact_dist.link.zenoh.presence import ShardPresence
+from enact_dist.link.zenoh.queries import ShardPresence
 
 QUIET_S = 1.0
 """A thread that waits in a channel of Zenoh's wakes ten times in this."""

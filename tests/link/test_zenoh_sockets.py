@@ -17,9 +17,9 @@ import zenoh
 
 from enact_dist.link.zenoh import config as zenoh_config
 from enact_dist.link.zenoh import links as zenoh_links
-from enact_dist.link.zenoh.carrier import wait_connected
 from enact_dist.link.zenoh.config import close_session, open_session
 from enact_dist.link.zenoh.links import _lost_after, connections, give_up, settle, unanswered
+from enact_dist.link.zenoh.queries import wait_connected
 
 LINGER = struct.Struct("ii")
 ZENOHS = (1, 10)
@@ -29,7 +29,7 @@ def linger_of(connection):
     return LINGER.unpack(connection.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, LINGER.size))
 
 
-def patience_ms_of(connection):
+def user_timeout_ms_of(connection):
     return connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT)
 
 
@@ -53,7 +53,7 @@ def test_only_zenohs_sockets_of_the_session_are_settled(before, known, after):
 
         found = settle({ports if known else ports[::-1]: 1.5})
 
-        assert (linger_of(connection)[0], patience_ms_of(connection)) == after
+        assert (linger_of(connection)[0], user_timeout_ms_of(connection)) == after
         assert found == (after[1] > 0)
 
 
@@ -92,7 +92,7 @@ def settled(port):
         with connection, contextlib.suppress(OSError):  # one that listens has no other end
             ports = connection.getsockname()[1], connection.getpeername()[1]
             if port in ports and not linger_of(connection)[0]:
-                found.append(patience_ms_of(connection))
+                found.append(user_timeout_ms_of(connection))
     return sorted(found)
 
 
@@ -209,13 +209,13 @@ def test_connections_of_all_sessions_are_settled_together(watching, monkeypatch)
     """Of a hundred none is looked for alone, and those that have gone are not looked for."""
     settled, begun, go_on = queue.SimpleQueue(), threading.Event(), threading.Event()
 
-    def settle_later(patience_s):
-        settled.put(patience_s)
+    def settle_later(user_timeout_s):
+        settled.put(user_timeout_s)
         begun.set()
         go_on.wait(30.0)
 
     monkeypatch.setattr(zenoh_links, "settle", settle_later)
-    first, second = watching(patience_s=1.0), watching(patience_s=2.0)
+    first, second = watching(user_timeout_s=1.0), watching(user_timeout_s=2.0)
     first(link_events("+")[0])
     assert begun.wait(30.0)
     for event in link_events("+-+"):
@@ -257,13 +257,16 @@ def watching():
     """Watch made-up events: `watching(connect)` gives what tells one."""
     made = []
 
-    def make(connect=(), patience_s=1.0):
+    def make(connect=(), user_timeout_s=1.0):
         callbacks = []
         info = SimpleNamespace(
             declare_link_events_listener=lambda callback, **_: callbacks.append(callback)
         )
         made.append(
-            (zenoh_links.LinkWatch(SimpleNamespace(info=info), connect, patience_s), callbacks[0])
+            (
+                zenoh_links.LinkWatch(SimpleNamespace(info=info), connect, user_timeout_s),
+                callbacks[0],
+            )
         )
         return callbacks[0]
 
@@ -279,8 +282,8 @@ def test_connections_are_looked_after_again_after_an_error(watching, monkeypatch
     """A process that is short of descriptors for a moment cannot list its connections."""
     settled = queue.SimpleQueue()
 
-    def settle_or_fail(patience_s):
-        settled.put(set(patience_s))
+    def settle_or_fail(user_timeout_s):
+        settled.put(set(user_timeout_s))
         raise OSError(errno.EMFILE, "too many open files")
 
     monkeypatch.setattr(zenoh_links, "settle", settle_or_fail)
@@ -342,8 +345,8 @@ def test_loss_that_is_noted_after_the_session_was_closed_is_not_looked_after(wat
     """The thread that looks after all sessions was busy; another session keeps it going."""
     settled, go_on = queue.SimpleQueue(), threading.Event()
 
-    def settle_late(patience_s):
-        settled.put(patience_s)
+    def settle_late(user_timeout_s):
+        settled.put(user_timeout_s)
         assert go_on.wait(30)
 
     monkeypatch.setattr(zenoh_links, "settle", settle_late)
@@ -364,7 +367,7 @@ def test_loss_that_is_noted_after_the_session_was_closed_is_not_looked_after(wat
     stays(again)
     settled.get(timeout=30)
 
-    assert not zenoh_links._keeper._round._losing
+    assert not zenoh_links._keeper._round.losing
 
 
 def test_looks_for_a_lost_connection_come_more_and_more_rarely(watching, monkeypatch):

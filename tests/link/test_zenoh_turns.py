@@ -8,9 +8,9 @@ import zenoh
 
 from enact_dist.core.protocol.messages import Hello, ListLocks, Ping
 from enact_dist.link.host import TICK_S_MAX
-from enact_dist.link.host_guards import STALL_S
+from enact_dist.link.host_figures import STALL_S
+from enact_dist.link.zenoh import fairness
 from enact_dist.link.zenoh import service as zenoh_service
-from enact_dist.link.zenoh import turns
 from enact_dist.link.zenoh.config import close_session, open_session
 from enact_dist.wire.frames import encode_frame
 from enact_dist.wire.keys import request_key, verb_of
@@ -203,7 +203,7 @@ def test_tick_that_waits_for_many_requests_is_no_stall_of_the_shard():
 
 def test_requests_without_room_are_dropped_counted_and_named(stopped, sender, monkeypatch, caplog):
     """Beyond its share a client stays without an answer, which tells it to ask again."""
-    monkeypatch.setattr(turns, "OF_ONE_MAX", 5)
+    monkeypatch.setattr(fairness, "OF_ONE_MAX", 5)
     for name in [*names("a", 20), "b0"]:
         sender.post(name)
     stopped.wait_arrived()
@@ -212,4 +212,4 @@ def test_requests_without_room_are_dropped_counted_and_named(stopped, sender, mo
 
     assert sender.answered == ["x", "a0", "b0", "a1", "a2", "a3", "a4"]
     assert stopped.host.figures()["requests_dropped"] == 15
-    assert [r.getMessage() for r in caplog.records if "too many requests of a," in r.getMessage()]
+    assert [r.getMessage() for r in caplog.records if "too many requests from a," in r.getMessage()]

@@ -88,7 +88,7 @@ def main():
         print("found", json.dumps(found(cell)), flush=True)
         print(
             "ways",
-            json.dumps([cell._client.carrier.way_to(s.name) for s in cell.shards()]),
+            json.dumps([cell._client.carrier.transport_of(s.name) for s in cell.shards()]),
             flush=True,
         )
 

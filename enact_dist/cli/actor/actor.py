@@ -209,7 +209,7 @@ def _rates_hz(config: CellConfig) -> dict[str, float]:
         return {}
     try:
         with connect(
-            config.path, actor="enact", timeout_s=LOOK_S, patience_s=LOOK_S, observer=True
+            config.path, actor="enact", timeout_s=LOOK_S, request_timeout_s=LOOK_S, observer=True
         ) as cell:
             infos = cell.actors()
     except EnactError:

@@ -201,7 +201,7 @@ def _lived(
             run.answer()
             say(formatter, "actor.ready", f"{READY} actor {name} in cell {cell.name}")
             life.ready()
-            _warn_of_namesakes(cell, name)
+            _warn_of_same_name(cell, name)
 
         with ListeningForWords(made.actor, run, cell, restart):
             statistics = _run(run, ready)
@@ -243,10 +243,10 @@ def _bound(made: _Made, cell: Cell, life: Life) -> ActorRun:
         raise ConfigError(str(error)) from error
 
 
-def _warn_of_namesakes(cell: Cell, name: str) -> None:
+def _warn_of_same_name(cell: Cell, name: str) -> None:
     """Say which other actors of this name run; several may be meant, so none is refused."""
     try:
-        others = cell.namesakes(name)
+        others = cell.sessions_named(name)
     except EnactError as error:
         _log.info("whether another actor %s runs is not known: %s", name, error)
         return

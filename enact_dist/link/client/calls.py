@@ -105,7 +105,7 @@ def bytes_with(writes: Iterable[WriteItem]) -> int:
     return size
 
 
-def patience_s(request: Request) -> float:
+def request_timeout_s(request: Request) -> float:
     """Return how long to wait for the answer to one call."""
     if isinstance(request, Acquire):
         return request.wait_ns / 1e9 + CALL_S

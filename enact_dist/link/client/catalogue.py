@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from enact_dist.core.protocol.messages import PlacementMap, Request
     from enact_dist.link.carrier import Carrier
-    from enact_dist.link.client.namesakes import Doubts
+    from enact_dist.link.client.duplicate_daemons import Doubts
 
 PAUSE_NS: Final = 1_000_000_000
 """Pause after a failure: each attempt may open a session."""

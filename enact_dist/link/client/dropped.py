@@ -12,52 +12,22 @@ import sys
 import threading
 import warnings
 import weakref
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.core.protocol.messages import Goodbye
 from enact_dist.errors import EnactError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from types import FrameType
 
-    from enact_dist.core.client.client import Client
-    from enact_dist.link.carrier import Carrier
-    from enact_dist.link.client.pauses import Pauses
+    from enact_dist.link.client.locks import CellClient
 
 GOODBYE_S: Final = 0.5
 """How long the shards of a dropped session may take to answer the goodbye."""
 _PACKAGE: Final = "enact_dist."
 
 
-class Connected(Protocol):
-    """What has to end with a session: its carrier, its keep-alives and its place at the shards."""
-
-    @property
-    def carrier(self) -> Carrier:
-        """Reaches the shards."""
-
-    @property
-    def core(self) -> Client:
-        """The session itself."""
-
-    @property
-    def pauses(self) -> Pauses:
-        """Where its threads wait."""
-
-
-def weakly(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function that calls a bound method while its object lives, else returns None."""
-    found = weakref.WeakMethod(method)
-
-    def call(*arguments: Any) -> Any:
-        bound = found()
-        return bound(*arguments) if bound is not None else None
-
-    return call
-
-
-def when_dropped(client: Connected, name: str, host: Any) -> weakref.finalize[Any, Any]:
+def when_dropped(client: CellClient, name: str, host: Any) -> weakref.finalize[Any, Any]:
     """End a session, and the shard inside this process, once nothing refers to it any more.
 
     Args:

@@ -20,19 +20,19 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from enact_dist.core.protocol.datum import Datum, Slot
-from enact_dist.core.protocol.messages import EpochChanged, Fetch, Gone, Refused, Slice
+from enact_dist.core.protocol.datum import Datum
+from enact_dist.core.protocol.messages import EpochChanged, Fetch, Gone, Slice
 from enact_dist.errors import LeaseLostError, ProtocolError
 from enact_dist.link.client.transfer import Piece, Transfer, in_turn
 from enact_dist.link.memory.maps import RECYCLED_BYTES_MAX, body_of, plain_memory
-from enact_dist.link.refusals import error_of
+from enact_dist.link.refusals import error_for
 from enact_dist.wire.limits import BODY_BYTES_MAX
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from enact_dist.core.client.plan import Reading
-    from enact_dist.core.protocol.datum import Datum, LockId, Slot
+    from enact_dist.core.protocol.datum import LockId, Slot
     from enact_dist.core.protocol.messages import Answer, SlotState
     from enact_dist.link.client.locks import CellClient
 
@@ -238,6 +238,4 @@ def _checked(answer: Answer, call: Fetch, state: SlotState, lock: LockId) -> Sli
             " was lost or its shard restarted; take it again",
             cause="the datum was removed",
         )
-    if isinstance(answer, Refused):
-        raise error_of(answer)
-    raise ProtocolError(f"{type(answer).__name__} came as the answer to Fetch")
+    raise error_for(answer, "a Fetch")

@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.messages import Welcome
 from enact_dist.errors import LinkError
+from enact_dist.link.client.duplicate_daemons import Doubts
 from enact_dist.link.client.locks import CellClient
-from enact_dist.link.client.namesakes import Doubts
 from enact_dist.link.socket.carrier import SocketCarrier
-from enact_dist.link.zenoh.carrier import POLL_S, ZenohCarrier
+from enact_dist.link.zenoh.carrier import ZenohCarrier
 from enact_dist.link.zenoh.config import OPEN_S
 from enact_dist.link.zenoh.discovery import discover
+from enact_dist.link.zenoh.queries import POLL_S
 from enact_dist.wire.keys import identity_of
 
 if TYPE_CHECKING:

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import random
 import threading
-from typing import TYPE_CHECKING, Final, Protocol
+import weakref
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from enact_dist.core.client.backoff import SignsOfLife
 
 if TYPE_CHECKING:
-    import weakref
     from collections.abc import Callable
 
     from enact_dist.core.client.client import Client
@@ -33,7 +33,7 @@ class Pauses:
 
     def __init__(self) -> None:
         self.returns = 0
-        self._hurried = False
+        self._used = False
         self._over = False
         self._changed = threading.Condition(threading.Lock())
 
@@ -57,15 +57,15 @@ class Pauses:
         """Pause as `rest`, but only until the session is used; return whether it was."""
         with self._changed:
             over = self._changed.wait_for(
-                lambda: self._over or self.returns != returns or self._hurried, max(0.0, pause_s)
+                lambda: self._over or self.returns != returns or self._used, max(0.0, pause_s)
             )
-            hurried, self._hurried = self._hurried, False
-            return over and hurried and not self._over and self.returns == returns
+            used, self._used = self._used, False
+            return over and used and not self._over and self.returns == returns
 
-    def hurry(self) -> None:
+    def end_long_pause(self) -> None:
         """End a long pause of the keep-alive thread, because the session is used."""
         with self._changed:
-            self._hurried = True
+            self._used = True
             self._changed.notify_all()
 
     @property
@@ -78,6 +78,17 @@ class Pauses:
         with self._changed:
             self._over = True
             self._changed.notify_all()
+
+
+def weakly(method: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that calls a bound method while its object lives, else returns None."""
+    found = weakref.WeakMethod(method)
+
+    def call(*arguments: Any) -> Any:
+        bound = found()
+        return bound(*arguments) if bound is not None else None
+
+    return call
 
 
 class Renewed(Protocol):
@@ -96,11 +107,11 @@ def keep_renewing(found: weakref.ref[Renewed], pauses: Pauses) -> None:
     while (session := found()) is not None:
         pause_s = session.next_renewal_s()
         del session  # its last user may drop it during this wait
-        hurried = pauses.rest_of_renewal(pause_s, returns)
+        used = pauses.rest_of_renewal(pause_s, returns)
         if pauses.over:
             return
         returns = pauses.returns
-        session = None if hurried else found()
+        session = None if used else found()
         if session is not None:
             session.renew()
         del session
@@ -156,6 +167,6 @@ class Renewal:
         with self._mutex:
             self._used_ns = now_ns
             self._signs.used(now_ns, self._core.ttl_ns)
-            hurry, self._rests_long = self._rests_long, False
-        if hurry:
-            self._pauses.hurry()
+            rested_long, self._rests_long = self._rests_long, False
+        if rested_long:
+            self._pauses.end_long_pause()

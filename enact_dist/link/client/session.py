@@ -39,11 +39,10 @@ from enact_dist.core.protocol.messages import (
 from enact_dist.core.protocol.placement import shard_of
 from enact_dist.errors import EnactError, MisuseError
 from enact_dist.link.carrier import FORKED_REMEDY
-from enact_dist.link.client.calls import CALL_S, Calls, patience_s
+from enact_dist.link.client.calls import CALL_S, Calls, request_timeout_s
 from enact_dist.link.client.catalogue import CATALOGUES, FurtherShards, KnownCatalogue
-from enact_dist.link.client.dropped import weakly
 from enact_dist.link.client.lanes import Lanes
-from enact_dist.link.client.pauses import Pauses, Renewal, keep_renewing
+from enact_dist.link.client.pauses import Pauses, Renewal, keep_renewing, weakly
 from enact_dist.link.clock import boottime_ns
 from enact_dist.link.memory.names import FIRST_STAGED
 from enact_dist.link.memory.payload_client import SharedPayloads
@@ -56,7 +55,7 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.messages import Request, Survey, WorldEntry
     from enact_dist.errors import ShardUnreachableError
     from enact_dist.link.carrier import Begun, Carrier, NoticeFeed
-    from enact_dist.link.client.namesakes import Doubts
+    from enact_dist.link.client.duplicate_daemons import Doubts
 
 FINISH_S: Final = 10.0
 """Default time for repeating a call before its shard counts as unreachable."""
@@ -85,7 +84,7 @@ class SessionClient:
     """Calls, catalogue and life of one session of this process with one cell.
 
     Attributes:
-        patience_s: How long a call is repeated by default.
+        request_timeout_s: How long a call is repeated by default.
         catalogue: What is known of the shards' catalogues.
     """
 
@@ -102,7 +101,7 @@ class SessionClient:
         self.core = client
         self.forked = False
         self.closed = False
-        self.patience_s = FINISH_S
+        self.request_timeout_s = FINISH_S
         self.notice_numbers: dict[str, tuple[int, int]] = {}
         self.counters: dict[str, int] = {}
         self.staged_numbers = itertools.count(FIRST_STAGED)
@@ -136,7 +135,7 @@ class SessionClient:
         self._take(welcome.shard, self.core.hello(welcome.shard), welcome)
         if self._renewer is not None:
             self._renewer.start()
-            self.carrier.tell_returns(weakly(self._shard_returned))
+            self.carrier.on_reconnect(weakly(self._shard_returned))
 
     def close(self) -> None:
         """Say goodbye to every shard and end; idempotent."""
@@ -172,7 +171,7 @@ class SessionClient:
         """Make one idempotent call, repeating it until it is answered.
 
         Raises:
-            ShardUnreachableError: No answer within `timeout_s` (None: `patience_s`).
+            ShardUnreachableError: No answer within `timeout_s` (None: `request_timeout_s`).
         """
         return self.call_all([(shard, request)], timeout_s=timeout_s)[0]
 
@@ -187,7 +186,7 @@ class SessionClient:
         answers = self.call_each(calls, timeout_s=timeout_s)
         for (shard, _), answer in zip(calls, answers, strict=True):
             if answer is None:
-                waited_s = self.patience_s if timeout_s is None else timeout_s
+                waited_s = self.request_timeout_s if timeout_s is None else timeout_s
                 raise self.unreachable(shard, waited_s)
         return [answer for answer in answers if answer is not None]
 
@@ -223,8 +222,8 @@ class SessionClient:
         return made.answers
 
     def _deadline_ns(self, timeout_s: float | None) -> int:
-        """Return the deadline of calls with this time limit (None: `patience_s`)."""
-        wait_s = self.patience_s if timeout_s is None else timeout_s
+        """Return the deadline of calls with this time limit (None: `request_timeout_s`)."""
+        wait_s = self.request_timeout_s if timeout_s is None else timeout_s
         return self._now_ns() + int(min(wait_s, CALLS_S_MAX) * 1e9)
 
     def ask_each(
@@ -314,8 +313,8 @@ class SessionClient:
             self._further.check(calls)
         if len(calls) == 1:
             shard, request = calls[0]
-            return [self.carrier.request(shard, request, timeout_s=patience_s(request))]
-        longest_s = max((patience_s(request) for _, request in calls), default=CALL_S)
+            return [self.carrier.request(shard, request, timeout_s=request_timeout_s(request))]
+        longest_s = max((request_timeout_s(request) for _, request in calls), default=CALL_S)
         return self.carrier.request_all(calls, timeout_s=longest_s)
 
     def _take(self, shard: str, request: Request, answer: Answer, sent_in: int = 0) -> None:
@@ -427,7 +426,7 @@ class SessionClient:
             found = self.ask_each(missing, lambda *_: request, timeout_s=timeout_s)
             for shard, answer in found.items():
                 if answer is None:
-                    raise self.unreachable(shard, timeout_s or self.patience_s)
+                    raise self.unreachable(shard, timeout_s or self.request_timeout_s)
                 if isinstance(answer, Refused):
                     raise error_of(answer)
             restarted = [shard for shard in missing if self.core.epoch(shard) != epochs[shard]]

@@ -24,28 +24,26 @@ from __future__ import annotations
 import logging
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import chain, zip_longest
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 from enact_dist.core.protocol.datum import Datum
-from enact_dist.core.protocol.messages import EpochChanged, Refused, Stage, Staged, WriteItem
+from enact_dist.core.protocol.messages import EpochChanged, Stage, Staged, WriteItem
 from enact_dist.errors import (
     SHARD_RESTARTED,
     EnactError,
     LeaseLostError,
-    ProtocolError,
     ShardUnreachableError,
 )
 from enact_dist.link.client.calls import BYTES_PER_S_MIN, CALL_S
 from enact_dist.link.memory.names import FIRST_STAGED
-from enact_dist.link.refusals import error_of, unreachable
+from enact_dist.link.refusals import error_for, unreachable
 from enact_dist.wire.limits import PAYLOAD_BYTES_MIN
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from enact_dist.core.client.client import Client
     from enact_dist.core.protocol.messages import Answer, Request
@@ -63,7 +61,7 @@ _log = logging.getLogger("enact.link")
 class Sender(Protocol):
     """What a transfer needs of the session that makes it."""
 
-    patience_s: float
+    request_timeout_s: float
 
     @property
     def staged_numbers(self) -> Iterator[int]:
@@ -179,9 +177,7 @@ def _check_staged(shard: str, file: str, answer: Answer) -> None:
             " it: the lock is lost and nothing was written; take it again and redo the work",
             cause=SHARD_RESTARTED,
         )
-    if isinstance(answer, Refused):
-        raise error_of(answer)
-    raise ProtocolError(f"{type(answer).__name__} came as the answer to a slice of {file}")
+    raise error_for(answer, f"a slice of {file}")
 
 
 WINDOW_BYTES: Final = 8 << 20
@@ -273,10 +269,11 @@ class Transfer:
             if piece is None:
                 return
             self._bytes += piece.size
-            begun = self._client.begin(piece.shard, piece.request, timeout_s=self._patience_s())
+            timeout_s = self._answer_timeout_s()
+            begun = self._client.begin(piece.shard, piece.request, timeout_s=timeout_s)
             self._under_way.append((piece, begun))
 
-    def _patience_s(self) -> float:
+    def _answer_timeout_s(self) -> float:
         """Return how long the answer to a slice may take behind all that is in flight."""
         rate = BYTES_PER_S_MIN
         if self._received:
@@ -302,7 +299,7 @@ class Transfer:
     def _recover(self, shard: str) -> None:
         """Wait a little before repeating slices, unless the transfer has to end."""
         silent_s = time.monotonic() - self._heard_s
-        if silent_s >= self._client.patience_s:
+        if silent_s >= self._client.request_timeout_s:
             raise unreachable(shard, silent_s, self._client.carrier.endpoint_of)
         self._alive()
         self._client.rest(self._pause_s)

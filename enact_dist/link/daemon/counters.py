@@ -1,7 +1,8 @@
-"""What the counters of a shard and of a connection mean, and what to do if one grows.
+"""What the figures of a shard and of a connection mean, and what to do if one grows.
 
 A shard counts from its start (`enact shard ls --counters`, `--json`, `/metrics`), a connection from
-its own (`Cell.statistics`).  A counter without a remedy counts work done, or is harmless.
+its own (`Cell.statistics`).  Help texts, metrics and their documentation are made of these tables.
+A figure without a remedy counts work done, or is harmless.
 """
 
 from __future__ import annotations
@@ -20,17 +21,22 @@ BODIES: Final = (
 
 
 class Counter(NamedTuple):
-    """One counter.
+    """One figure.
 
     Attributes:
-        meaning: What it counts.
+        meaning: What it counts or measures.
         remedy: What to do if it grows; empty if growth is normal.
-        now: Whether it is a current value, which may fall again, instead of a count.
+        kind: As in Prometheus: "counter", "gauge" (a current value, which may fall again) or
+            "histogram" (latencies).
     """
 
     meaning: str
     remedy: str = ""
-    now: bool = False
+    kind: str = "counter"
+
+
+def _gauge(meaning: str, remedy: str = "") -> Counter:
+    return Counter(meaning, remedy, "gauge")
 
 
 _BUSY: Final = "look for a busy host: top, and the shard's log"
@@ -115,27 +121,23 @@ OF_A_SHARD: Final[dict[str, Counter]] = {
         "of these, commits that another shard had committed: only a part took effect",
         "enact lock audit",
     ),
-    "alarms": Counter(
-        "of these, conflicts that no operator has acknowledged yet", "enact lock audit", now=True
+    "alarms": _gauge(
+        "of these, conflicts that no operator has acknowledged yet", "enact lock audit"
     ),
     # This process and its host
     "namesakes_found": Counter(
         "times that the shard found two daemons with the same shard name",
         "the shard's log names their hosts; stop all but the one whose data you want to keep",
     ),
-    "namesakes": Counter(
-        "shards of the cell that more than one daemon serves now", "enact doctor", now=True
+    "namesakes": _gauge("shards of the cell that more than one daemon serves now", "enact doctor"),
+    "audit_left_out": _gauge(
+        "operator actions too old for enact lock audit, which lists the newest 1,000"
     ),
-    "audit_left_out": Counter(
-        "operator actions too old for enact lock audit, which lists the newest 1,000",
-        now=True,
-    ),
-    "catalogue_left_out": Counter(
+    "catalogue_left_out": _gauge(
         "world contexts and aspects that do not fit into the catalogue sent to clients",
         "stop the cell and run enact shard forget --unused",
-        now=True,
     ),
-    "draining": Counter("1 while the shard shuts down and grants no new locks", now=True),
+    "draining": _gauge("1 while the shard shuts down and grants no new locks"),
     "stalls": Counter("times that this host stood still; leases were extended by that time", _BUSY),
     "disk_stalls": Counter(
         "disk writes that took more than a second",
@@ -189,7 +191,7 @@ OF_A_SHARD: Final[dict[str, Counter]] = {
         "check the disk; the shard's log names the data",
     ),
     # History
-    "retained_bytes": Counter("bytes of older versions kept now", now=True),
+    "retained_bytes": _gauge("bytes of older versions kept now"),
     "retained_dropped": Counter(
         "older versions removed early: the limit of 256 MiB", "retain fewer versions of large data"
     ),
@@ -198,10 +200,10 @@ OF_A_SHARD: Final[dict[str, Counter]] = {
         "raise shared_bytes_max, or retain fewer versions of large data",
     ),
     # Large data
-    "payload_files": Counter("payloads stored here now", now=True),
-    "payload_bytes": Counter("bytes of payloads and drafts now", now=True),
-    "payload_bytes_max": Counter("limit of the shared folder in bytes; 0 if it has none", now=True),
-    "payload_drafts": Counter("payloads here now that no commit has named yet", now=True),
+    "payload_files": _gauge("payloads stored here now"),
+    "payload_bytes": _gauge("bytes of payloads and drafts now"),
+    "payload_bytes_max": _gauge("limit of the shared folder in bytes; 0 if it has none"),
+    "payload_drafts": _gauge("payloads here now that no commit has named yet"),
     "payloads_adopted": Counter("payloads that a commit has named"),
     "payloads_missing": Counter(
         "payloads that a commit named before they arrived; the client sent them again"
@@ -244,6 +246,38 @@ OF_A_CONNECTION: Final[dict[str, Counter]] = {
     "payload_folders_elsewhere": Counter(
         "shards whose shared folder this process cannot see",
         "for containers: mount one tmpfs in all of them, see enact_dist/docs/large_data.md",
+    ),
+}
+
+
+GAUGES_OF_A_SHARD: Final[dict[str, Counter]] = {
+    "ready": _gauge(
+        "1 while the shard grants locks, 0 right after its start and while it shuts down"
+    ),
+    "epoch": _gauge(
+        "number of this start; it changes with each restart", "the shard's log says why"
+    ),
+    "uptime_seconds": _gauge("time since this start"),
+    "sessions": _gauge("clients that are connected, or were until a moment ago"),
+    "slots": _gauge("slots on this shard, including null ones"),
+    "slot_bytes": _gauge(
+        f"bytes of the newest data of all slots: {BODIES}", "enact world tree shows each"
+    ),
+    "locks_held": _gauge("locks held now"),
+    "locks_waiting": _gauge("locks waiting now", "enact lock ls shows who holds them up"),
+    "requests_parked": _gauge("requests waiting for an answer"),
+}
+
+LATENCIES_OF_A_SHARD: Final[dict[str, Counter]] = {
+    "lock_wait_seconds": Counter(
+        "time from the first request of a lock to its grant here",
+        "enact lock ls shows the holders; hold locks for less time, or use View",
+        "histogram",
+    ),
+    "store_write_seconds": Counter(
+        "time to store a batch of records, on the disk if an aspect is durable",
+        "move the shard's folder to a faster disk",
+        "histogram",
     ),
 }
 

@@ -23,11 +23,11 @@ from enact_dist.core.protocol.messages import ListLocks, Locks
 from enact_dist.core.protocol.records import Called, ShardReturned
 from enact_dist.errors import ConfigError, EnactError, LinkError
 from enact_dist.link.client.calls import Calls
-from enact_dist.link.client.namesakes import (
+from enact_dist.link.client.duplicate_daemons import (
     Comparing,
+    expected_places,
     moved_places,
     serving,
-    told_places,
     two_daemons,
 )
 from enact_dist.link.daemon.service_manager import ServiceManager
@@ -37,8 +37,7 @@ from enact_dist.link.log import READY, JsonLines, Log, TextLines, say
 from enact_dist.link.memory.shared_folder import SharedFolder
 from enact_dist.link.signals import StopSignals
 from enact_dist.link.socket.service import SocketService
-from enact_dist.link.zenoh.access import listening_settings
-from enact_dist.link.zenoh.config import close_session, open_session, to_reach
+from enact_dist.link.zenoh.config import close_session, listening_settings, open_session, to_reach
 from enact_dist.link.zenoh.discovery import FoundShard, find_shards
 from enact_dist.link.zenoh.endpoints import somebody_listens
 from enact_dist.link.zenoh.service import ZenohService
@@ -174,12 +173,9 @@ class RunningShard:
             if not self.host.wait_idle(drain_s):
                 self._name_holders(drain_s)
             self.host.drain()  # requests parked meanwhile are answered, too
-            self.host.close()
-            self._calls.close()
-            self._comparing.close()
-            if self._sockets is not None:
-                self._sockets.close()
-            self._service.close()
+            for part in (self.host, self._calls, self._comparing, self._sockets, self._service):
+                if part is not None:
+                    part.close()
             close_session(self._session)
             if self._metrics is not None:
                 self._metrics.close()
@@ -187,9 +183,9 @@ class RunningShard:
                 self._shared.close()
             self._ended.set()
 
-    def hurry(self) -> None:
+    def stop_now(self) -> None:
         """End the wait of a drain."""
-        self.host.hurry()
+        self.host.stop_now()
 
     def _name_holders(self, drain_s: float) -> None:
         held = []
@@ -208,9 +204,9 @@ class RunningShard:
             ]
         if held:
             _log.warning(
-                "%d locks are lost, still held when the drain of %g s was over: %s; to give them"
-                " more time: --drain, or ENACT_SHARD_<NAME>_DRAIN_S, or drain_s in [shards.%s] of"
-                " cell.toml; the first of these that is set counts",
+                "%d locks are lost because they were still held when the drain of %g s ended: %s;"
+                " to give them more time, set --drain, ENACT_SHARD_<NAME>_DRAIN_S, or drain_s in"
+                " [shards.%s] of cell.toml; the first of these that is set counts",
                 len(held),
                 drain_s,
                 "; ".join(held),
@@ -282,8 +278,8 @@ def refuse_second_daemon(settings: DaemonSettings, *, probe_s: float = PROBE_S) 
             " must not serve one shard: stop the other, or give this one another name"
         )
     others = [entry for entry in shards if entry.name != name]
-    told = told_places(cell, others, timeout_s=probe_s) if others else ()
-    for shard, places in moved_places(expected, chain.from_iterable(told)).items():
+    reported = expected_places(cell, others, timeout_s=probe_s) if others else ()
+    for shard, places in moved_places(expected, chain.from_iterable(reported)).items():
         daemons = serving(cell, shard, places, timeout_s=probe_s)
         if shard == name and daemons:
             raise LinkError(
@@ -312,7 +308,7 @@ def run_shard(settings: DaemonSettings) -> int:
             return 1
         try:
             signals.call(lambda word: _stop(shard, word, manager))
-            signals.call_again(lambda _: shard.hurry())
+            signals.call_again(lambda _: shard.stop_now())
             shard.host.each_tick(lambda: manager.alive(shard.host.state))
             _say_ready(shard, formatter)
             manager.ready(shard.host.state)

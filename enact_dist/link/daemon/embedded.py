@@ -31,9 +31,9 @@ class _Call:
 
     __slots__ = ("answer", "done", "timeout_s")
 
-    def __init__(self) -> None:
+    def __init__(self, timeout_s: float) -> None:
         self.answer: Answer | None = None
-        self.timeout_s = 0.0
+        self.timeout_s = timeout_s
         self.done = threading.Lock()  # a bare lock wakes twice as fast as an Event
         self.done.acquire()
 
@@ -80,38 +80,21 @@ class EmbeddedCarrier:
             ShardUnreachableError: `shard` is not the shard of this process.
             MisuseError: The carrier is closed or was opened before a fork.
         """
-        call = self._begin(shard, message)
-        if call.answer is None:
-            call.done.acquire(timeout=max(0.0, timeout_s))
-        return call.answer
+        call = self.begin(shard, message, timeout_s=timeout_s)
+        return call.answer if call.answer is not None else call.wait()
 
     def request_all(
         self, requests: Sequence[tuple[str, Request]], *, timeout_s: float
     ) -> list[Answer | None]:
-        """Make all calls, then wait for the parked ones.
-
-        Raises:
-            ShardUnreachableError: As `request`.
-            MisuseError: As `request`.
-        """
-        calls = [self._begin(shard, message) for shard, message in requests]
+        """Make all calls, then wait for the parked ones."""
+        calls = [self.begin(shard, message, timeout_s=timeout_s) for shard, message in requests]
         deadline_s = time.monotonic() + timeout_s
         for call in calls:
             call.done.acquire(timeout=max(0.0, deadline_s - time.monotonic()))
         return [call.answer for call in calls]
 
     def begin(self, shard: str, message: Request, *, timeout_s: float) -> _Call:
-        """Make a call whose answer the caller awaits later.
-
-        Raises:
-            ShardUnreachableError: As `request`.
-            MisuseError: As `request`.
-        """
-        call = self._begin(shard, message)
-        call.timeout_s = timeout_s
-        return call
-
-    def _begin(self, shard: str, message: Request) -> _Call:
+        """Make a call whose answer the caller awaits later."""
         self._check_usable()
         if shard != self._host.name:
             raise ShardUnreachableError(
@@ -119,7 +102,7 @@ class EmbeddedCarrier:
                 shard=shard,
                 endpoint="this process",
             )
-        call = _Call()
+        call = _Call(timeout_s)
         if self._host.ended:
             call.done.release()
         else:
@@ -152,7 +135,7 @@ class EmbeddedCarrier:
     def add_endpoints(self, entries: Sequence[ShardEntry]) -> None:
         """Do nothing: there is no other shard."""
 
-    def way_to(self, shard: str) -> str:
+    def transport_of(self, shard: str) -> str:
         """Return the transport, for people: calls stay inside this process."""
         return "call"
 
@@ -160,7 +143,7 @@ class EmbeddedCarrier:
         """Return False: the shard is in this process."""
         return False
 
-    def tell_returns(self, returned: Callable[[str], None]) -> None:
+    def on_reconnect(self, returned: Callable[[str], None]) -> None:
         """Do nothing: the shard is within reach while this process lives."""
 
     def endpoint_of(self, shard: str) -> str:

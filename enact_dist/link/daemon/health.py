@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from itertools import chain
 from typing import TYPE_CHECKING
 
 from enact_dist.core.protocol.messages import Ping, Pong
@@ -60,16 +61,10 @@ def of_shards(
         ConfigError: An endpoint cannot be read.
         ProtocolError: An answer cannot be read.
     """
-    started_s = time.monotonic()
-    reached = {name: list(dict.fromkeys(map(to_reach, some))) for name, some in endpoints.items()}
-    everywhere = list(dict.fromkeys(endpoint for some in reached.values() for endpoint in some))
-    shards = [FoundShard(cell, name) for name in reached]
-    answers = ask_shards(everywhere, shards, Ping(), timeout_s=timeout_s)
-    took_s = time.monotonic() - started_s
-    return [
-        _health(shard.shard, answers.get(shard), ", ".join(reached[shard.shard]), took_s)
-        for shard in shards
-    ]
+    reached = {name: tuple(dict.fromkeys(map(to_reach, some))) for name, some in endpoints.items()}
+    everywhere = tuple(dict.fromkeys(chain.from_iterable(reached.values())))
+    places = {FoundShard(cell, name): ", ".join(some) for name, some in reached.items()}
+    return _asked(everywhere, places, time.monotonic(), timeout_s)
 
 
 def of_endpoint(endpoint: str, name: str | None, *, timeout_s: float) -> list[ShardHealth]:
@@ -85,17 +80,25 @@ def of_endpoint(endpoint: str, name: str | None, *, timeout_s: float) -> list[Sh
     wanted = [shard for shard in found if name in (None, shard.shard)]
     if not wanted:
         there = ", ".join(shard.shard for shard in found)
+        who = f"no shard {name}" if name else "no shard"
         raise ShardUnreachableError(
-            f"no shard {name or ''} answers at {endpoint} (waited {timeout_s:g} s)".replace(
-                "  ", " "
-            )
+            f"{who} answers at {endpoint} (waited {timeout_s:g} s)"
             + (f"; there is {there}" if there else "; is one running there? (enact shard run)"),
             shard=name or "",
             endpoint=endpoint,
         )
-    answers = ask_shards([endpoint], wanted, Ping(), timeout_s=timeout_s)
+    return _asked([endpoint], dict.fromkeys(wanted, endpoint), started_s, timeout_s)
+
+
+def _asked(
+    endpoints: Sequence[str], places: Mapping[FoundShard, str], started_s: float, timeout_s: float
+) -> list[ShardHealth]:
+    """Ask shards at endpoints; `places` says for people where each is expected."""
+    answers = ask_shards(endpoints, tuple(places), Ping(), timeout_s=timeout_s)
     took_s = time.monotonic() - started_s
-    return [_health(shard.shard, answers.get(shard), endpoint, took_s) for shard in wanted]
+    return [
+        _health(shard.shard, answers.get(shard), place, took_s) for shard, place in places.items()
+    ]
 
 
 def _health(name: str, answer: object, endpoint: str, took_s: float) -> ShardHealth:

@@ -1,14 +1,12 @@
 """The metrics that a shard serves to Prometheus: counters and gauges, in text format 0.0.4.
 
-Each counter of `link.daemon.counters` becomes ``enact_NAME_total``, and each current value
+Each counter of `link.daemon.counters` becomes ``enact_NAME_total``, and each other figure
 ``enact_NAME``, with the meaning given there as help text.  All samples have the labels `cell` and
-`shard`. The table in `deploy/metrics.md` is `table()`.
+`shard`.  The table in `deploy/metrics.md` is `table()`.
 
-Serves one page over HTTP, from threads that never block the shard.
-
-A slow reader occupies one of `READERS_MAX` threads, for at most `READ_S` per step; further readers
-are refused.  While the process has no free descriptor, new connections stay in the queue and are
-tried again after a pause.
+The page is served over HTTP from threads that never block the shard.  A slow reader occupies one of
+`READERS_MAX` threads, for at most `READ_S` per step; further readers are refused.  While the
+process has no free descriptor, new connections stay in the queue and are tried again after a pause.
 """
 
 from __future__ import annotations
@@ -24,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 
 from enact_dist.core.state.clock import BOUNDS_S
 from enact_dist.errors import LinkError
-from enact_dist.link.daemon.counters import BODIES, OF_A_SHARD
+from enact_dist.link.daemon.counters import GAUGES_OF_A_SHARD, LATENCIES_OF_A_SHARD, OF_A_SHARD
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -133,7 +131,9 @@ class _Server(ThreadingMixIn, TCPServer):
             self._room.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        _log.info("a reader of the metrics at %s left in mid-answer", client_address)
+        _log.info(
+            "a reader of the metrics at %s disconnected before it had the answer", client_address
+        )
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -159,63 +159,20 @@ CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 
 
 class Metric(NamedTuple):
-    """One metric.
-
-    Attributes:
-        name: Its name in Prometheus.
-        kind: "counter", "gauge" or "histogram".
-        meaning: What it measures.
-        remedy: What to do if it grows; empty if growth is normal.
-        figure: Its name in the figures or latencies of a `ShardHost`.
-    """
+    """One metric: its name in Prometheus and in the figures of a `ShardHost`; see `Counter`."""
 
     name: str
-    kind: str
+    figure: str
     meaning: str
     remedy: str
-    figure: str
+    kind: str
 
 
-_NOW: Final = {
-    "ready": (
-        "1 while the shard grants locks, 0 right after its start and while it shuts down",
-        "",
-    ),
-    "epoch": ("number of this start; it changes with each restart", "the shard's log says why"),
-    "uptime_seconds": ("time since this start", ""),
-    "sessions": ("clients that are connected, or were until a moment ago", ""),
-    "slots": ("slots on this shard, including null ones", ""),
-    "slot_bytes": (
-        f"bytes of the newest data of all slots: {BODIES}",
-        "enact world tree shows each",
-    ),
-    "locks_held": ("locks held now", ""),
-    "locks_waiting": ("locks waiting now", "enact lock ls shows who holds them up"),
-    "requests_parked": ("requests waiting for an answer", ""),
-}
-_TOOK: Final = {
-    "lock_wait_seconds": (
-        "time from the first request of a lock to its grant here",
-        "enact lock ls shows the holders; hold locks for less time, or use View",
-    ),
-    "store_write_seconds": (
-        "time to store a batch of records, on the disk if an aspect is durable",
-        "move the shard's folder to a faster disk",
-    ),
-}
-
-
-def _metrics() -> Iterator[Metric]:
-    for name, (meaning, remedy) in _NOW.items():
-        yield Metric(f"enact_{name}", "gauge", meaning, remedy, name)
-    for name, counter in OF_A_SHARD.items():
-        kind, ending = ("gauge", "") if counter.now else ("counter", "_total")
-        yield Metric(f"enact_{name}{ending}", kind, counter.meaning, counter.remedy, name)
-    for name, (meaning, remedy) in _TOOK.items():
-        yield Metric(f"enact_{name}", "histogram", meaning, remedy, name)
-
-
-METRICS: Final = tuple(_metrics())
+METRICS: Final = tuple(
+    Metric(f"enact_{name}{'_total' * (counter.kind == 'counter')}", name, *counter)
+    for table in (GAUGES_OF_A_SHARD, OF_A_SHARD, LATENCIES_OF_A_SHARD)
+    for name, counter in table.items()
+)
 """All metrics of a shard, in the order in which it serves them."""
 
 

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from collections.abc import MutableMapping
 
-TELL_S: Final = 1.0
+SEND_S: Final = 1.0
 """How long a message about a change may wait for a manager that is slow to read."""
 PINGS_PER_PERIOD: Final = 3
 
@@ -56,12 +56,12 @@ class ServiceManager:
 
     def ready(self, status: str = "") -> None:
         """Report that this process is ready."""
-        if self._tell(f"READY=1\n{_status_line(status)}MAINPID={os.getpid()}"):
+        if self._send(f"READY=1\n{_status_line(status)}MAINPID={os.getpid()}"):
             self._status = status
 
     def stopping(self, status: str = "") -> None:
         """Report that this process was asked to end."""
-        if self._tell(f"STOPPING=1\n{_status_line(status)}"):
+        if self._send(f"STOPPING=1\n{_status_line(status)}"):
             self._status = status
 
     def alive(self, status: str = "") -> None:
@@ -77,12 +77,12 @@ class ServiceManager:
         pings = bool(self.ping_s) and now_s >= self._ping_at_s
         if pings:
             line += "WATCHDOG=1"
-        if line and self._tell(line, wait_s=0.0):
+        if line and self._send(line, wait_s=0.0):
             self._status = status
             if pings:
                 self._ping_at_s = now_s + self.ping_s
 
-    def _tell(self, text: str, *, wait_s: float = TELL_S) -> bool:
+    def _send(self, text: str, *, wait_s: float = SEND_S) -> bool:
         """Send a message; return whether the manager got it."""
         if not self._address:
             return False

@@ -10,22 +10,21 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from typing import TYPE_CHECKING, Final, cast, get_args
+from typing import TYPE_CHECKING, Final
 
 import zenoh
 
-from enact_dist.core.protocol.messages import Answer, Request
 from enact_dist.core.shard.owners import shard_identity
 from enact_dist.errors import ProtocolError
 from enact_dist.link.zenoh.config import close_session, keep_after_fork, open_session
-from enact_dist.link.zenoh.presence import ShardPresence
-from enact_dist.wire.frames import decode_frame, encode_frame
+from enact_dist.link.zenoh.queries import ShardPresence, answer_in, next_reply, send_query
 from enact_dist.wire.keys import request_key, verb_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from enact_dist.core.protocol.messages import ShardEntry
+    from enact_dist.core.protocol.messages import Answer, Request, ShardEntry
+    from enact_dist.link.zenoh.queries import Replies
 
 CALL_S: Final = 1.0
 """How long a call may stay without an answer; the core repeats it anyway."""
@@ -36,7 +35,6 @@ JOIN_S: Final = 0.5
 SILENT_S: Final = 5.0
 """A shard that is silent for this time is logged, once."""
 
-_ANSWERS: Final = frozenset(get_args(Answer))
 _log = logging.getLogger("enact.link")
 
 
@@ -63,7 +61,7 @@ class ShardCalls:
         answered: Callable[[str, Request, Answer], None],
         returned: Callable[[str], None],
     ) -> None:
-        self._cell, self._name, self._lease_s = cell, name, lease_s
+        self._cell, self._identity, self._lease_s = cell, shard_identity(name), lease_s
         self._endpoints = {shard.name: shard.endpoints for shard in shards if shard.name != name}
         self._answered, self._returned = answered, returned
         self._mutex = threading.Lock()
@@ -82,7 +80,7 @@ class ShardCalls:
             if self._closed:
                 return
             if shard not in self._endpoints:
-                self._tell_unknown(shard)
+                self._log_unknown(shard)
                 return
             line = self._lines.get(shard) or self._opened(shard)
         if line is not None:
@@ -91,23 +89,25 @@ class ShardCalls:
     def _opened(self, shard: str) -> _Line | None:
         """Return a new line to a shard; None if the system has no more threads."""
         try:
-            line = _Line(
-                shard,
-                lambda request: request_key(
-                    self._cell, shard, verb_of(request), shard_identity(self._name)
-                ),
-                self._endpoints[shard],
-                self._lease_s,
-                lambda request, answer: self._answered(shard, request, answer),
-                lambda: self._returned(shard),
-            )
+            line = self._lines[shard] = _Line(self, shard, self._endpoints[shard], self._lease_s)
         except RuntimeError as error:
-            _log.warning("no call to shard %s now: %s", shard, error)
+            _log.warning("cannot call shard %s now: %s", shard, error)
             return None
-        self._lines[shard] = line
         return line
 
-    def _tell_unknown(self, shard: str) -> None:
+    def key_of(self, shard: str, request: Request) -> str:
+        """Return the key of a request of this shard to another one."""
+        return request_key(self._cell, shard, verb_of(request), self._identity)
+
+    def pass_answer(self, shard: str, request: Request, answer: Answer) -> None:
+        """Pass on an answer."""
+        self._answered(shard, request, answer)
+
+    def pass_return(self, shard: str) -> None:
+        """Report that a shard is within reach."""
+        self._returned(shard)
+
+    def _log_unknown(self, shard: str) -> None:
         """Log once that a lock was prepared with a shard that the cell no longer has."""
         if shard not in self._unknown:
             self._unknown[shard] = None
@@ -134,24 +134,17 @@ class _Line:
     """The connection to one other shard.  After any failure the next calls try again."""
 
     def __init__(
-        self,
-        shard: str,
-        key_of: Callable[[Request], str],
-        endpoints: tuple[str, ...],
-        lease_s: float,
-        answered: Callable[[Request, Answer], None],
-        returned: Callable[[], None],
+        self, calls: ShardCalls, shard: str, endpoints: tuple[str, ...], lease_s: float
     ) -> None:
-        self._shard = shard
-        self._key_of, self._endpoints, self._lease_s = key_of, endpoints, lease_s
-        self._answered, self._returned = answered, returned
+        self._calls, self._shard = calls, shard
+        self._endpoints, self._lease_s = endpoints, lease_s
         self._queued: dict[Request, None] = {}
         self._wake = threading.Condition(threading.Lock())
         self._ending = False
         self._session: zenoh.Session | None = None
         self._presence: ShardPresence | None = None
         self._silent_since_s: float | None = None
-        self._silence_told = False
+        self._silence_logged = False
         keep_after_fork(self)
         self._thread = threading.Thread(target=self._run, name="enact-calls", daemon=True)
         self._thread.start()
@@ -173,7 +166,7 @@ class _Line:
                 self._note_silence(answered=bool(answers))
                 for request, answer in answers:
                     if not self._ending:
-                        self._answered(request, answer)
+                        self._calls.pass_answer(self._shard, request, answer)
         finally:
             self._close_session()
 
@@ -186,37 +179,45 @@ class _Line:
         session = self._session
         if session is None:
             session = self._session = open_session(connect=self._endpoints, lease_s=self._lease_s)
+        keys = [self._calls.key_of(self._shard, call) for call in calls]
         if self._presence is None:
-            self._watch(session, self._key_of(calls[0]))
-        sent = [(request, self._send(session, request)) for request in calls]
+            self._watch(session, keys[0])
+        sent = [
+            (call, send_query(session, key, call, timeout_s=CALL_S))
+            for call, key in zip(calls, keys, strict=True)
+        ]
         end_s = time.monotonic() + CALL_S
-        received = [(request, _receive(replies, end_s)) for request, replies in sent]
+        received = [(call, _receive(self._shard, replies, end_s)) for call, replies in sent]
         return [(request, answer) for request, answer in received if answer is not None]
 
     def _watch(self, session: zenoh.Session, key: str) -> None:
         """Watch the shard; on failure the next calls try again, and these are made anyway."""
         try:
-            self._presence = ShardPresence(session, key, self._tell_returned)
+            self._presence = ShardPresence(session, key, self._report_return)
         except (zenoh.ZError, RuntimeError) as error:  # closed meanwhile, or no thread available
             if not self._ending:
                 _log.warning("shard %s is not watched at the moment: %s", self._shard, error)
 
-    def _tell_returned(self) -> None:
+    def _report_return(self) -> None:
         if not self._ending:
-            self._returned()
+            self._calls.pass_return(self._shard)
 
     def _note_silence(self, *, answered: bool) -> None:
         """Log once that the shard is away, and once that it is back."""
         now_s = time.monotonic()
         if answered:
-            if self._silence_told:
+            if self._silence_logged:
                 _log.info("shard %s answers again", self._shard)
-            self._silent_since_s, self._silence_told = None, False
+            self._silent_since_s, self._silence_logged = None, False
             return
         if self._silent_since_s is None:
             self._silent_since_s = now_s
-        if not self._silence_told and now_s - self._silent_since_s >= SILENT_S and not self._ending:
-            self._silence_told = True
+        if (
+            not self._silence_logged
+            and now_s - self._silent_since_s >= SILENT_S
+            and not self._ending
+        ):
+            self._silence_logged = True
             _log.warning(
                 "shard %s at %s does not answer; commits over it and this shard wait for it, and"
                 " keep their locks here (enact lock ls)",
@@ -231,21 +232,6 @@ class _Line:
                 self._wake.wait()
             calls, self._queued = list(self._queued), {}
             return None if self._ending else calls
-
-    def _send(self, session: zenoh.Session, request: Request) -> zenoh.Handler[zenoh.Reply] | None:
-        header, payload = encode_frame(request)
-        try:
-            return session.get(
-                self._key_of(request),
-                payload=payload,
-                attachment=header,
-                timeout=CALL_S,
-                consolidation=zenoh.ConsolidationMode.NONE,
-                priority=zenoh.Priority.INTERACTIVE_HIGH,
-                congestion_control=zenoh.CongestionControl.BLOCK,
-            )
-        except zenoh.ZError:
-            return None
 
     def end(self) -> None:
         """Take no more calls and let pending ones end without an answer."""
@@ -268,23 +254,12 @@ class _Line:
             close_session(session)
 
 
-def _receive(replies: zenoh.Handler[zenoh.Reply] | None, end_s: float) -> Answer | None:
+def _receive(shard: str, replies: Replies | None, end_s: float) -> Answer | None:
     """Return the answer that came, or None; Zenoh itself ends the wait after `CALL_S`."""
-    if replies is None or time.monotonic() > end_s + CALL_S:
+    if time.monotonic() > end_s + CALL_S or (sample := next_reply(replies)) is None:
         return None
     try:
-        sample = replies.recv().ok
-    except zenoh.ZError:  # ended without a reply
-        return None
-    if sample is None:
-        return None
-    header, payload = sample.attachment, sample.payload
-    try:
-        answer = decode_frame(
-            bytes(header) if header is not None else b"",
-            bytes(payload) if payload is not None else b"",
-        )
+        return answer_in(sample, shard)
     except ProtocolError as error:
         _log.warning("cannot read another shard's answer: %s", error)
         return None
-    return cast("Answer", answer) if type(answer) in _ANSWERS else None

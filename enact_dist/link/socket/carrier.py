@@ -258,7 +258,7 @@ class SocketCarrier:
                 f" be used: {problem}"
             )
 
-    def way_to(self, shard: str) -> str:
+    def transport_of(self, shard: str) -> str:
         """Return how calls to a shard travel now, for people: "socket" or "zenoh (why)"."""
         line = self._lines.get(shard)
         if line is None:
@@ -287,7 +287,7 @@ class SocketCarrier:
         line = self._lines.get(shard)
         return (line is None or bool(line.problem)) and self._behind.away(shard)
 
-    def tell_returns(self, returned: Callable[[str], None]) -> None:
+    def on_reconnect(self, returned: Callable[[str], None]) -> None:
         """Call `returned` with the name of each shard that comes (back) within reach."""
         lines = self._lines
 
@@ -297,7 +297,7 @@ class SocketCarrier:
                 line.try_again()
             returned(shard)
 
-        self._behind.tell_returns(told)
+        self._behind.on_reconnect(told)
 
     def endpoint_of(self, shard: str) -> str:
         """Return the shard's expected endpoint, for messages to people."""

@@ -15,6 +15,7 @@ from typing import Final, Protocol
 from enact_dist.core.protocol.messages import Answer, Outcome, Refused, Release, Request, Survey
 from enact_dist.core.shard.owners import SESSION_OF, not_yours
 from enact_dist.errors import LinkError, ProtocolError
+from enact_dist.link.answers import encoded, size_of
 from enact_dist.link.notices import Interest
 from enact_dist.link.socket.frames import (
     BUFFER_BYTES,
@@ -28,7 +29,6 @@ from enact_dist.link.socket.frames import (
 )
 from enact_dist.link.socket.peers import Peer
 from enact_dist.link.socket.watcher import Publisher, SocketWatcher
-from enact_dist.link.zenoh.senders import encoded, size_of
 from enact_dist.patterns import checked_patterns
 from enact_dist.wire.frames import decode_frame, decode_request
 

@@ -10,11 +10,10 @@ Rules that a change must keep:
 - Channels only, no Python callbacks: a library that holds the interpreter lock for half a minute
   would stall Zenoh's receiving thread, and with it the token (measured).
 - Control calls have a high priority, data a lower one, and slices a separate connection
-  (`link.zenoh.bulk`), so that a keep-alive never queues behind a mesh.  Until that is connected,
-  slices are requested with DROP, which their answers inherit: a slow reader then loses an answer
-  instead of the connection with its token.
-- A query without a reply, or with the error "Timeout", is *unknown*.  Two replies to one query mean
-  two daemons with one name: that is an error.
+  (`_Link.bulk`), so that a keep-alive never queues behind a mesh.  Until that is connected, slices
+  are requested with DROP, which their answers inherit: a slow reader then loses an answer instead
+  of the connection with its token.
+- Two replies to one query mean two daemons with one name: that is an error.
 """
 
 from __future__ import annotations
@@ -22,7 +21,6 @@ from __future__ import annotations
 import logging
 import os
 import threading
-import time
 from collections import deque
 from dataclasses import dataclass
 from functools import partial
@@ -30,11 +28,11 @@ from typing import TYPE_CHECKING, Final
 
 import zenoh
 
-from enact_dist.core.protocol.messages import Answer, Commit, Notice, Ping, Prepare
+from enact_dist.core.protocol.messages import Notice
 from enact_dist.errors import ProtocolError, ShardUnreachableError
 from enact_dist.link.carrier import check_usable, failure_of
+from enact_dist.link.memory.maps import recycle_blocks
 from enact_dist.link.notices import NoticeQueue
-from enact_dist.link.zenoh.bulk import BulkWay
 from enact_dist.link.zenoh.config import (
     OPEN_S,
     QUEUED_MAX,
@@ -42,28 +40,30 @@ from enact_dist.link.zenoh.config import (
     keep_after_fork,
     open_session,
 )
-from enact_dist.link.zenoh.presence import Inside, ShardPresence
-from enact_dist.wire.frames import decode_answer, decode_frame, encode_frame
-from enact_dist.wire.keys import notice_key, request_key, token_key, verb_of
+from enact_dist.link.zenoh.queries import (
+    QUESTION,
+    ShardPresence,
+    answer_in,
+    bytes_of,
+    next_reply,
+    send_query,
+    wait_connected,
+)
+from enact_dist.wire.frames import decode_frame
+from enact_dist.wire.keys import ANY, notice_key, request_key, token_key, verb_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from enact_dist.core.protocol.messages import Request, ShardEntry, Survey
+    from enact_dist.core.protocol.messages import Answer, Request, ShardEntry, Survey
     from enact_dist.link.carrier import Begun
+    from enact_dist.link.zenoh.queries import Replies
 
 _log = logging.getLogger("enact.link")
-CONTROL_BYTES_MAX: Final = 16 << 10
-"""Requests with more data than this leave the control priority to the others."""
 FETCH_BYTES: Final = 1 << 20
 """Slices of this size delay the answers to other clients by only a few ms."""
 CONNECT_S: Final = 5.0
 """How long opening a carrier waits for a first connection."""
-POLL_S: Final = 0.005
-"""How often a carrier being opened looks for a connection.  A session opens connected if its
-shard is running, so the first look usually suffices; and no channel of Zenoh's Python binding,
-which
-would tell of a later connection, can be waited on for a limited time."""
 REACH_S: Final = 0.3
 """How long a shard may take to show that it is already within reach."""
 JOIN_S: Final = 1.0
@@ -71,25 +71,53 @@ JOIN_S: Final = 1.0
 UNCHECKED_MAX: Final = 256
 """Answered queries that are still watched for a second reply."""
 
-QUESTION: Final = Ping()
-"""The cheapest request: answered at once, changes nothing."""
-_NONE = zenoh.ConsolidationMode.NONE
-_BLOCK, _DROP = zenoh.CongestionControl.BLOCK, zenoh.CongestionControl.DROP
-_CONTROL, _DATA, _BULK = (
-    zenoh.Priority.INTERACTIVE_HIGH,
-    zenoh.Priority.DATA,
-    zenoh.Priority.DATA_LOW,
-)
 
-
-@dataclass(frozen=True, slots=True)
 class _Link:
-    """One Zenoh session of the carrier, with its token, which lives as long as this object."""
+    """One Zenoh session with the client's token, and a second connection for slices of data.
 
-    session: zenoh.Session
-    endpoints: tuple[str, ...]
-    token: zenoh.LivelinessToken
-    bulk: BulkWay
+    Zenoh sends urgent messages first, but cannot take back data that it has passed to the kernel:
+    on a slow network a keep-alive would wait behind everything in the socket.  With a separate
+    connection for slices it waits for nothing.  The slice connection may block, which slows the
+    sender to the speed of the network and loses no slice; it may even be closed when its reader
+    stalls, since token and calls use the other one.  It opens with the first transfer, takes 3 ms,
+    and reconnects by itself.
+
+    Attributes:
+        endpoints: Where it connects.
+        session: Carries calls and the token.
+    """
+
+    def __init__(
+        self, endpoints: tuple[str, ...], token: str, lease_s: float, open_s: float
+    ) -> None:
+        self.endpoints = endpoints
+        self._open = partial(open_session, connect=endpoints, lease_s=lease_s, open_s=open_s)
+        self._mutex = threading.Lock()
+        self._closed = False
+        self._bulk: zenoh.Session | None = None
+        self.session = self._open()
+        self._token = self.session.liveliness().declare_token(token)
+        keep_after_fork(self)
+
+    def bulk(self) -> zenoh.Session | None:
+        """Return the session for slices; None while it is not connected."""
+        session = self._bulk
+        if session is None:
+            with self._mutex:
+                if self._bulk is None and not self._closed:
+                    recycle_blocks()
+                    self._bulk = self._open()
+                session = self._bulk
+        return session if session is not None and session.info.peers_zid() else None
+
+    def end(self) -> None:
+        """Close both sessions and end all calls on them."""
+        with self._mutex:
+            self._closed = True
+        if self._bulk is not None:
+            close_session(self._bulk)
+        self._token.undeclare()  # type: ignore[no-untyped-call]  # as in Zenoh's stub
+        close_session(self.session)
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +126,31 @@ class _Pump:
 
     subscriber: zenoh.Subscriber[zenoh.Handler[zenoh.Sample]]
     thread: threading.Thread
+
+
+class Inside:
+    """Counts the threads inside Zenoh, so that shutdown can wait for them."""
+
+    __slots__ = ("_changed", "_count")
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition(threading.Lock())
+        self._count = 0
+
+    def __enter__(self) -> None:
+        with self._changed:
+            self._count += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._changed:
+            self._count -= 1
+            if not self._count:
+                self._changed.notify_all()
+
+    def wait_empty(self, timeout_s: float) -> bool:
+        """Wait until no thread is inside; return whether that happened in time."""
+        with self._changed:
+            return self._changed.wait_for(lambda: not self._count, timeout_s)
 
 
 class ZenohCarrier:
@@ -148,10 +201,9 @@ class ZenohCarrier:
         self._link_of: dict[str, _Link] = {}
         self._endpoints_of: dict[str, tuple[str, ...]] = {}
         self._feeds: dict[NoticeQueue, list[_Pump]] = {}
-        self._keys: dict[tuple[str, type], str] = {}
         self._presences: dict[str, ShardPresence] = {}
         self._returned: Callable[[str], None] = lambda _: None
-        self._unchecked: deque[zenoh.Handler[zenoh.Reply]] = deque(maxlen=UNCHECKED_MAX)
+        self._unchecked: deque[Replies] = deque(maxlen=UNCHECKED_MAX)
         keep_after_fork(self)
         first = self._open_link(tuple(endpoints))
         if not wait_connected(first.session, connect_s):
@@ -165,27 +217,13 @@ class ZenohCarrier:
     # ---------------------------------------------------------------- requests
 
     def request(self, shard: str, message: Request, *, timeout_s: float) -> Answer | None:
-        """Send one request and return its answer, or None if none came in time.
-
-        Raises:
-            ProtocolError: An answer cannot be read, or two daemons answer for one shard.
-            MisuseError: The carrier is closed or was opened before a fork.
-        """
-        with self._inside:
-            self._check_usable()
-            replies = self._send(shard, message, timeout_s)
-            self._check_answered_once()
-            return self._receive(shard, replies)
+        """Send one request and return its answer, or None if none came in time."""
+        return self.request_all(((shard, message),), timeout_s=timeout_s)[0]
 
     def request_all(
         self, requests: Sequence[tuple[str, Request]], *, timeout_s: float
     ) -> list[Answer | None]:
-        """Send all requests before waiting for the first answer; answers in the same order.
-
-        Raises:
-            ProtocolError: As `request`.
-            MisuseError: As `request`.
-        """
+        """Send all requests before waiting for the first answer; answers in the same order."""
         with self._inside:
             self._check_usable()
             sent = [(shard, self._send(shard, message, timeout_s)) for shard, message in requests]
@@ -193,68 +231,40 @@ class ZenohCarrier:
                 self._check_answered_once()
             return [self._receive(shard, replies) for shard, replies in sent]
 
-    def _send(
-        self, shard: str, message: Request, timeout_s: float
-    ) -> zenoh.Handler[zenoh.Reply] | None:
-        link = self._link_of.get(shard) or self._links[0]
-        header, payload = encode_frame(message)
-        priority = _CONTROL
-        if isinstance(message, Commit | Prepare) and payload and len(payload) > CONTROL_BYTES_MAX:
-            priority = _DATA
-        return _asked(
-            link.session,
-            self._key(shard, message),
-            header,
-            payload,
-            timeout_s=timeout_s,
-            priority=priority,
-            congestion=_BLOCK,
-        )
+    def _send(self, shard: str, message: Request, timeout_s: float) -> Replies | None:
+        session, key = self._link_to(shard).session, self._key(shard, message)
+        return send_query(session, key, message, timeout_s=timeout_s)
 
     def begin(self, shard: str, message: Request, *, timeout_s: float) -> Begun:
-        """Send the request for one slice; the caller awaits its answer later.
-
-        Raises:
-            ProtocolError: The request cannot be sent.
-            MisuseError: As `request`.
-        """
+        """Send the request for one slice; the caller awaits its answer later."""
         with self._inside:
             self._check_usable()
-            link = self._link_of.get(shard) or self._links[0]
-            header, payload = encode_frame(message)
-            session = link.bulk.session()
-            replies = _asked(
-                session or link.session,
+            link = self._link_to(shard)
+            bulk = link.bulk()
+            replies = send_query(
+                bulk or link.session,
                 self._key(shard, message),
-                header,
-                payload,
+                message,
                 timeout_s=timeout_s,
-                priority=_BULK,
-                congestion=_DROP if session is None else _BLOCK,
+                priority=zenoh.Priority.DATA_LOW,
+                drop=bulk is None,
             )
             return _Begun(partial(self._wait, shard, replies))
 
-    def _wait(self, shard: str, replies: zenoh.Handler[zenoh.Reply] | None) -> Answer | None:
+    def _wait(self, shard: str, replies: Replies | None) -> Answer | None:
         with self._inside:
             self._check_answered_once()
             return self._receive(shard, replies)
 
-    def _key(self, shard: str, message: Request) -> str:
-        known = (shard, type(message))
-        key = self._keys.get(known)
-        if key is None:
-            key = request_key(self._cell, shard, verb_of(message), self._identity)
-            self._keys[known] = key
-        return key
+    def _link_to(self, shard: str) -> _Link:
+        return self._link_of.get(shard) or self._links[0]
 
-    def _receive(self, shard: str, replies: zenoh.Handler[zenoh.Reply] | None) -> Answer | None:
-        if replies is None:
-            return None
-        try:
-            sample = replies.recv().ok
-        except zenoh.ZError:  # ended without a reply
-            return None
-        if sample is None:  # the error that stands for a timeout
+    def _key(self, shard: str, message: Request) -> str:
+        return request_key(self._cell, shard, verb_of(message), self._identity)
+
+    def _receive(self, shard: str, replies: Replies | None) -> Answer | None:
+        sample = next_reply(replies)
+        if replies is None or sample is None:
             return None
         self._unchecked.append(replies)
         return answer_in(sample, shard)
@@ -282,13 +292,7 @@ class ZenohCarrier:
     # ---------------------------------------------------------------- links
 
     def add_endpoints(self, entries: Sequence[ShardEntry]) -> None:
-        """Connect to all further shards that can be reached; existing connections stay.
-
-        Raises:
-            ConfigError: An endpoint cannot be read.
-            LinkError: Some cannot be connected; the message gives the reasons.
-            MisuseError: The carrier is closed or was opened before a fork.
-        """
+        """Connect to all further shards that can be reached; existing connections stay."""
         self._check_usable()
         failures: dict[str, Exception] = {}
         for name, endpoints in entries:
@@ -308,8 +312,8 @@ class ZenohCarrier:
             self._link_of[name] = reaching or self._open_link(endpoints)
         if name not in self._presences:
             session, key = self._link_of[name].session, self._key(name, QUESTION)
-            told = partial(self._tell_returned, name)
-            self._presences[name] = ShardPresence(session, key, told)
+            returned = partial(self._report_return, name)
+            self._presences[name] = ShardPresence(session, key, returned)
 
     def _link_reaching(self, shard: str, endpoints: Sequence[str]) -> _Link | None:
         """Return the link that already reaches `shard`, perhaps at another of its addresses."""
@@ -321,11 +325,8 @@ class ZenohCarrier:
         return None
 
     def _open_link(self, endpoints: tuple[str, ...]) -> _Link:
-        session = open_session(connect=endpoints, lease_s=self._lease_s, open_s=self._open_s)
-        token = session.liveliness().declare_token(
-            token_key(self._cell, self._identity, self._session)
-        )
-        link = _Link(session, endpoints, token, BulkWay(endpoints, self._lease_s, self._open_s))
+        token = token_key(self._cell, self._identity, self._session)
+        link = _Link(endpoints, token, self._lease_s, self._open_s)
         with self._mutex:
             late = self._closed  # closed by another thread while this link was opened
             if not late:
@@ -333,11 +334,11 @@ class ZenohCarrier:
                 for feed, pumps in self._feeds.items():
                     pumps.append(self._pump_into(feed, link))
         if late:
-            close_session(session)
+            link.end()
             self._check_usable()
         return link
 
-    def way_to(self, shard: str) -> str:
+    def transport_of(self, shard: str) -> str:
         """Return the transport, for people."""
         return "zenoh"
 
@@ -346,11 +347,11 @@ class ZenohCarrier:
         presence = self._presences.get(shard)
         return presence is not None and not presence.here
 
-    def tell_returns(self, returned: Callable[[str], None]) -> None:
+    def on_reconnect(self, returned: Callable[[str], None]) -> None:
         """Call `returned` with the name of each shard that comes (back) within reach."""
         self._returned = returned
 
-    def _tell_returned(self, shard: str) -> None:
+    def _report_return(self, shard: str) -> None:
         if not self._closed:
             self._returned(shard)
 
@@ -376,7 +377,7 @@ class ZenohCarrier:
 
     def _pump_into(self, feed: NoticeQueue, link: _Link) -> _Pump:
         subscriber = link.session.declare_subscriber(
-            notice_key(self._cell, "*"), zenoh.handlers.RingChannel(QUEUED_MAX)
+            notice_key(self._cell, ANY), zenoh.handlers.RingChannel(QUEUED_MAX)
         )
         thread = threading.Thread(
             target=_pump, args=(subscriber.handler, feed), name="enact-notices", daemon=True
@@ -409,37 +410,11 @@ class ZenohCarrier:
         for presence in list(self._presences.values()):
             presence.close(JOIN_S)
         for link in self._links:
-            link.bulk.close()
-            link.token.undeclare()  # type: ignore[no-untyped-call]  # as in Zenoh's stub
-            close_session(link.session)
+            link.end()
         for pump in pumps:
             pump.thread.join(JOIN_S)
         # A thread that returns from Zenoh while the interpreter exits would abort the process.
         self._inside.wait_empty(JOIN_S)
-
-
-def _asked(
-    session: zenoh.Session,
-    key: str,
-    header: bytes,
-    payload: bytes | None,
-    *,
-    timeout_s: float,
-    priority: zenoh.Priority,
-    congestion: zenoh.CongestionControl,
-) -> zenoh.Handler[zenoh.Reply] | None:
-    try:
-        return session.get(
-            key,
-            payload=payload,
-            attachment=header,
-            timeout=max(timeout_s, 0.001),
-            consolidation=_NONE,
-            priority=priority,
-            congestion_control=congestion,
-        )
-    except zenoh.ZError:  # closed meanwhile by another thread
-        return None
 
 
 class _Begun:
@@ -466,33 +441,9 @@ def _pump(notices: zenoh.Handler[zenoh.Sample], feed: NoticeQueue) -> None:
         except zenoh.ZError:
             return
         try:
-            message = decode_frame(_bytes(sample.attachment), _bytes(sample.payload))
+            message = decode_frame(bytes_of(sample.attachment), bytes_of(sample.payload))
         except Exception as error:  # noqa: BLE001 - the next one can be read
             _log.warning("cannot read a notice: %s", error)
             continue
         if isinstance(message, Notice):
             feed.put(message)
-
-
-def _bytes(payload: zenoh.ZBytes | None) -> bytes:
-    """Copy out of Zenoh's buffer: keeping a small piece of it would pin 64 KiB."""
-    return bytes(payload) if payload is not None else b""
-
-
-def answer_in(sample: zenoh.Sample, shard: str) -> Answer:
-    """Return the answer that a reply carries.
-
-    Raises:
-        ProtocolError: It cannot be read or is no answer.
-    """
-    return decode_answer(shard, _bytes(sample.attachment), _bytes(sample.payload))
-
-
-def wait_connected(session: zenoh.Session, wait_s: float) -> bool:
-    """Wait until the session has a peer; False if it has none after `wait_s`."""
-    deadline_s = time.monotonic() + wait_s
-    while not session.info.peers_zid():
-        if time.monotonic() > deadline_s:
-            return False
-        time.sleep(POLL_S)
-    return True

@@ -7,27 +7,35 @@ with its full name, and the client learns the rest of the cell from that shard's
 from __future__ import annotations
 
 import time
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-import zenoh
-
-from enact_dist.core.protocol.messages import Refused, Welcome
-from enact_dist.errors import ProtocolError, ShardUnreachableError
-from enact_dist.link.refusals import error_of
-from enact_dist.link.zenoh.carrier import POLL_S, QUESTION, answer_in, wait_connected
+from enact_dist.core.protocol.messages import Welcome
+from enact_dist.errors import ShardUnreachableError
+from enact_dist.link.refusals import error_for
 from enact_dist.link.zenoh.config import close_session, open_session
 from enact_dist.link.zenoh.endpoints import unknown_hosts
-from enact_dist.wire.frames import encode_frame
+from enact_dist.link.zenoh.queries import (
+    POLL_S,
+    QUESTION,
+    answer_in,
+    send_query,
+    wait_connected,
+)
 from enact_dist.wire.keys import ANY, NAMELESS, identity_of, parse_request_key, request_key, verb_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
+
+    import zenoh
 
     from enact_dist.core.protocol.messages import Answer, Hello, Request
 
 PROBE_LEASE_S: Final = 1.0
 """Link lease of the short sessions that only look for shards."""
+SHORTEST_S: Final = 0.05
+"""Shortest time given to one query."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,11 +53,8 @@ def find_shards(endpoints: Sequence[str], *, timeout_s: float) -> tuple[FoundSha
         ConfigError: An endpoint cannot be read.
     """
     deadline_s = time.monotonic() + timeout_s
-    session = open_session(connect=endpoints, lease_s=PROBE_LEASE_S, open_s=timeout_s)
-    try:
+    with _probe(endpoints, timeout_s) as session:
         return _find(session, deadline_s)
-    finally:
-        close_session(session)
 
 
 def discover(endpoints: Sequence[str], hello: Hello, *, timeout_s: float) -> tuple[str, Welcome]:
@@ -61,21 +66,16 @@ def discover(endpoints: Sequence[str], hello: Hello, *, timeout_s: float) -> tup
         ProtocolError: An answer cannot be read, or does not answer a hello.
     """
     deadline_s = time.monotonic() + timeout_s
-    session = open_session(connect=endpoints, lease_s=PROBE_LEASE_S, open_s=timeout_s)
     silent = ""
-    try:
+    with _probe(endpoints, timeout_s) as session:
         while time.monotonic() < deadline_s:
             for found in _find(session, deadline_s):
                 silent = found.shard
                 answer = _greet(session, found, hello, deadline_s)
                 if isinstance(answer, Welcome):
                     return found.cell, answer
-                if isinstance(answer, Refused):
-                    raise error_of(answer)
                 if answer is not None:
-                    raise ProtocolError(f"shard {found.shard} answered a hello with {answer!r}")
-    finally:
-        close_session(session)
+                    raise error_for(answer, f"a hello to shard {found.shard}")
     where = ", ".join(endpoints)
     if silent:
         raise ShardUnreachableError(
@@ -104,24 +104,31 @@ def ask_shards(
     """
     deadline_s = time.monotonic() + timeout_s
     answers: dict[FoundShard, Answer] = {}
-    session = open_session(connect=endpoints, lease_s=PROBE_LEASE_S, open_s=timeout_s)
-    try:
+    with _probe(endpoints, timeout_s) as session:
         while (left_s := deadline_s - time.monotonic()) > 0 and len(answers) < len(shards):
             # A hung shard must leave the others time for a second query after they connect.
+            wait_s = max(SHORTEST_S, left_s / 2)
             asked = [
-                (shard, _get(session, _key(shard, message), message, max(0.05, left_s / 2)))
+                (shard, _replies(session, _key(shard, message), message, wait_s))
                 for shard in shards
                 if shard not in answers
             ]
             for shard, replies in asked:
-                for reply in replies:
-                    if reply.ok is not None:
-                        answers[shard] = answer_in(reply.ok, shard.shard)
+                for sample in replies:
+                    answers[shard] = answer_in(sample, shard.shard)
             if len(answers) < len(shards):
                 time.sleep(POLL_S)
+    return answers
+
+
+@contextmanager
+def _probe(endpoints: Sequence[str], timeout_s: float) -> Iterator[zenoh.Session]:
+    """Open a short session that only looks for shards."""
+    session = open_session(connect=endpoints, lease_s=PROBE_LEASE_S, open_s=timeout_s)
+    try:
+        yield session
     finally:
         close_session(session)
-    return answers
 
 
 def _key(shard: FoundShard, message: Request, identity: str = NAMELESS) -> str:
@@ -134,11 +141,8 @@ def _find(session: zenoh.Session, deadline_s: float) -> tuple[FoundShard, ...]:
         return ()
     key = request_key(ANY, ANY, verb_of(QUESTION), NAMELESS)
     while (left_s := deadline_s - time.monotonic()) > 0:
-        keys = [
-            str(reply.ok.key_expr)
-            for reply in _get(session, key, QUESTION, left_s)
-            if reply.ok is not None
-        ]
+        found = _replies(session, key, QUESTION, left_s)
+        keys = [str(sample.key_expr) for sample in found]
         if keys:
             return tuple({FoundShard(*parse_request_key(key)[:2]): None for key in keys})
         time.sleep(POLL_S)  # connected, but the peer's queryables are not known yet
@@ -149,22 +153,14 @@ def _greet(
     session: zenoh.Session, found: FoundShard, hello: Hello, deadline_s: float
 ) -> Answer | None:
     key = _key(found, hello, identity_of(hello.actor, hello.host, hello.pid))
-    for reply in _get(session, key, hello, max(0.05, deadline_s - time.monotonic())):
-        if reply.ok is not None:
-            return answer_in(reply.ok, found.shard)
-    return None
+    wait_s = max(SHORTEST_S, deadline_s - time.monotonic())
+    sample = next(_replies(session, key, hello, wait_s), None)
+    return answer_in(sample, found.shard) if sample is not None else None
 
 
-def _get(
+def _replies(
     session: zenoh.Session, key: str, message: Request, timeout_s: float
-) -> zenoh.Handler[zenoh.Reply]:
-    header, payload = encode_frame(message)
-    return session.get(
-        key,
-        payload=payload,
-        attachment=header,
-        timeout=timeout_s,
-        consolidation=zenoh.ConsolidationMode.NONE,
-        priority=zenoh.Priority.INTERACTIVE_HIGH,
-        congestion_control=zenoh.CongestionControl.BLOCK,
-    )
+) -> Iterator[zenoh.Sample]:
+    """Send a query now; return an iterator that waits for its replies."""
+    replies = send_query(session, key, message, timeout_s=timeout_s)
+    return (reply.ok for reply in replies or () if reply.ok is not None)

@@ -1,21 +1,16 @@
 """Watches the connections of Zenoh's sessions: none blocks others, a cut one is restored soon.
 
-`settle` describes the options that each new connection gets, and why.
+`settle` describes the options that each new connection gets beyond Zenoh's settings, and why.
 
 The kernel repeats unanswered connection attempts once a second at best, so after a cut Zenoh would
 reconnect up to 1.1 s late (0.6 s with this).  Therefore, from the loss of a connection to another
 host on, attempts that wait longer than `LOOK_S` are checked: if a connection of our own is answered
 at once, the network is back and the waiting attempt is aborted; Zenoh tries again after 50 ms.
 
-Sockets are found by listing all descriptors of the process.  One thread does that for all sessions
-of the process, at most once in `COST` times its duration, and less often the longer a connection
-has been lost: its cost grows neither with the number of connections nor with the time that a shard
-is away.
-
-Options for Zenoh's TCP sockets that its settings do not offer: see `settle` and `give_up`.
-
-Sockets are found among the open descriptors of this process; if the system does not list them (not
-Linux), nothing is done.
+Sockets are found among the open descriptors of the process; if the system does not list them (not
+Linux), nothing is done.  One thread lists them for all sessions of the process, at most once in
+`COST` times its duration, and less often the longer a connection has been lost: its cost grows
+neither with the number of connections nor with the time that a shard is away.
 """
 
 from __future__ import annotations
@@ -49,7 +44,7 @@ _SYN_SENT: Final = 2
 _INTERNET: Final = (socket.AF_INET, socket.AF_INET6)
 
 
-def settle(patience_s: Mapping[tuple[int, int], float]) -> int:
+def settle(user_timeout_s: Mapping[tuple[int, int], float]) -> int:
     """Make connections end if their peer acknowledges nothing, and close at once.
 
     Zenoh 1.10 waits for the kernel in two places, each time with threads that serve all clients:
@@ -64,7 +59,7 @@ def settle(patience_s: Mapping[tuple[int, int], float]) -> int:
       still sends the rest in the background.
 
     Args:
-        patience_s: Own and other port of each connection, and how long sent bytes, or a closed
+        user_timeout_s: Own and other port of each connection, and how long sent bytes, or a closed
             window, may stay as they are; only connections with exactly Zenoh's linger time count.
 
     Returns:
@@ -76,10 +71,10 @@ def settle(patience_s: Mapping[tuple[int, int], float]) -> int:
             if connection.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _LINGER.size) != _ZENOHS:
                 continue
             ports = connection.getsockname()[1], connection.getpeername()[1]
-            if ports not in patience_s:
+            if ports not in user_timeout_s:
                 continue
-            patience_ms = max(1, round(1e3 * patience_s[ports]))
-            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, patience_ms)
+            timeout_ms = max(1, round(1e3 * user_timeout_s[ports]))
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, timeout_ms)
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _NONE)
             found += 1
     return found
@@ -173,18 +168,20 @@ class LinkWatch:
 
     Attributes:
         lost: Destinations of lost connections, of a session that connects.
-        patience_s: As given.
+        user_timeout_s: As given.
         left: Whether the session is closed and no longer watched.
 
     Args:
         session: Stays open when this ends.
         connect: The endpoints that it connects to.
-        patience_s: How long sent bytes may stay unacknowledged.
+        user_timeout_s: How long sent bytes may stay unacknowledged.
     """
 
-    def __init__(self, session: zenoh.Session, connect: Sequence[str], patience_s: float) -> None:
+    def __init__(
+        self, session: zenoh.Session, connect: Sequence[str], user_timeout_s: float
+    ) -> None:
         self.lost: list[str] = []
-        self.patience_s = patience_s
+        self.user_timeout_s = user_timeout_s
         self.left = False
         self._connects = bool(connect)
         _keeper.enter(self)
@@ -192,7 +189,7 @@ class LinkWatch:
             self._events: Events[zenoh.LinkEvent] = Events(
                 "enact-link-events",
                 lambda callback: session.info.declare_link_events_listener(callback, history=True),
-                lambda event: _keeper.tell(self, event),
+                lambda event: _keeper.report(self, event),
             )
         except BaseException:
             _keeper.leave(self)
@@ -210,7 +207,7 @@ class LinkWatch:
         _keeper.leave(self)
 
 
-Told: TypeAlias = "tuple[LinkWatch, zenoh.LinkEvent]"
+Report: TypeAlias = "tuple[LinkWatch, zenoh.LinkEvent]"
 
 
 class _Keeper:
@@ -228,21 +225,20 @@ class _Keeper:
                 self._round = _Round()
             self._watches.add(watch)
 
-    def tell(self, watch: LinkWatch, event: zenoh.LinkEvent) -> None:
+    def report(self, watch: LinkWatch, event: zenoh.LinkEvent) -> None:
         """Report new or lost connections to the thread, without waiting for it."""
         current = self._round
         if current is not None:
-            current.told.put((watch, event))
+            current.events.put((watch, event))
 
     def leave(self, watch: LinkWatch) -> None:
         """Forget a session; with the last one the thread ends."""
         with self._mutex:
             self._watches.discard(watch)
             ended = None
-            if self._watches:
-                if self._round is not None:
-                    self._round.forget(watch)
-            else:
+            if self._round is not None:
+                self._round.losing.discard(watch)
+            if not self._watches:
                 ended, self._round = self._round, None
         if ended is not None:
             ended.end()
@@ -255,9 +251,9 @@ class _Round:
     """One life of that thread, from the first session to the end of the last one."""
 
     def __init__(self) -> None:
-        self.told: queue.SimpleQueue[Told | None] = queue.SimpleQueue()
+        self.events: queue.SimpleQueue[Report | None] = queue.SimpleQueue()
         self._over = threading.Event()
-        self._losing: set[LinkWatch] = set()
+        self.losing: set[LinkWatch] = set()
         self._lost_s = self._look_s = self._rest_until_s = 0.0
         self._waited: set[int] = set()
         self._thread = threading.Thread(target=self._run, name="enact-links", daemon=True)
@@ -268,23 +264,23 @@ class _Round:
             here = self._here()
             if self._over.wait(max(0.0, self._rest_until_s - time.monotonic())):
                 return
-            here += _all_here(self.told)  # one look settles all of them
+            here += _all_here(self.events)  # one look settles all of them
             began_s = time.thread_time()
             pause_s = 0.0
             try:
                 self._note(here)
-                if self._losing and time.monotonic() >= self._look_s:
-                    self._waited = _given_up(_hosts_of(self._losing), self._waited)
+                if self.losing and time.monotonic() >= self._look_s:
+                    self._waited = _given_up(_hosts_of(self.losing), self._waited)
             except Exception as error:  # noqa: BLE001 - no descriptor is free, most likely
                 _log.warning(_FAILED, error)
                 pause_s = FAILED_S
             self._rest(time.thread_time() - began_s, pause_s)
 
-    def _here(self) -> list[Told]:
+    def _here(self) -> list[Report]:
         """Wait for events, or until a look is due; return the events."""
-        wait_s = max(0.0, self._look_s - time.monotonic()) if self._losing else None
+        wait_s = max(0.0, self._look_s - time.monotonic()) if self.losing else None
         try:
-            first = self.told.get(timeout=wait_s)
+            first = self.events.get(timeout=wait_s)
         except queue.Empty:
             return []
         return [first] if first is not None else []
@@ -296,7 +292,7 @@ class _Round:
         later_s = min(LOOK_S_MAX, (now_s - self._lost_s) / LATER)
         self._look_s = now_s + max(LOOK_S, later_s, pause_s)
 
-    def _note(self, here: Sequence[Told]) -> None:
+    def _note(self, here: Sequence[Report]) -> None:
         """Record lost connections, and settle new ones if possible."""
         for watch in {watch: None for watch, _ in here}:
             events = [event for of, event in here if of is watch]
@@ -304,22 +300,18 @@ class _Round:
             watch.note(events)
             if watch.lost and watch.lost != before:
                 self._lost_s = self._look_s = time.monotonic()
-            (self._losing.add if _hosts_of((watch,)) else self._losing.discard)(watch)
+            (self.losing.add if _hosts_of((watch,)) else self.losing.discard)(watch)
             if watch.left:  # perhaps closed just now
-                self._losing.discard(watch)
+                self.losing.discard(watch)
         try:
             _settle_new(here)
         except Exception as error:  # noqa: BLE001 - what is lost is looked after all the same
             _log.warning(_FAILED, error)
 
-    def forget(self, watch: LinkWatch) -> None:
-        """Stop looking for the lost connections of a closed session."""
-        self._losing.discard(watch)
-
     def end(self) -> None:
         """End the thread."""
         self._over.set()
-        self.told.put(None)
+        self.events.put(None)
         if self._thread is not threading.current_thread():
             self._thread.join(JOIN_S)
 
@@ -333,11 +325,11 @@ def _given_up(hosts: Iterable[Host], waited: set[int]) -> set[int]:
     return set().union(*waiting.values())
 
 
-def _all_here(told: queue.SimpleQueue[Told | None]) -> list[Told]:
+def _all_here(events: queue.SimpleQueue[Report | None]) -> list[Report]:
     """Return all waiting events."""
     here = []
     with contextlib.suppress(queue.Empty):
-        while (one := told.get_nowait()) is not None:
+        while (one := events.get_nowait()) is not None:
             here.append(one)
     return here
 
@@ -347,13 +339,13 @@ def _has_come(event: zenoh.LinkEvent) -> bool:
     return event.kind == zenoh.SampleKind.PUT
 
 
-def _settle_new(here: Iterable[Told]) -> None:
+def _settle_new(here: Iterable[Report]) -> None:
     """Settle the new connections.
 
     A thousand that come at once are settled by one look, since each look lists all descriptors.
     """
     came = {
-        (_port_of(event.link.src), _port_of(event.link.dst)): watch.patience_s
+        (_port_of(event.link.src), _port_of(event.link.dst)): watch.user_timeout_s
         for watch, event in here
         if _has_come(event)
     }

@@ -25,21 +25,15 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import zenoh
 
-from enact_dist.core.protocol.messages import (
-    Answer,
-    Fetch,
-    Ping,
-    Refused,
-    Request,
-    Stage,
-)
+from enact_dist.core.protocol.messages import Answer, Fetch, Ping, Refused, Request, Stage
 from enact_dist.core.protocol.records import SessionSeen
 from enact_dist.core.shard.owners import named_session
 from enact_dist.errors import ProtocolError
+from enact_dist.link.answers import encoded, size_of
 from enact_dist.link.memory.maps import recycle_blocks
 from enact_dist.link.zenoh.config import QUEUED_MAX, keep_after_fork
-from enact_dist.link.zenoh.senders import Senders, encoded, size_of
-from enact_dist.link.zenoh.turns import Turns
+from enact_dist.link.zenoh.fairness import Senders, Turns
+from enact_dist.link.zenoh.queries import bytes_of
 from enact_dist.wire.frames import decode_request, encode_frame
 from enact_dist.wire.keys import (
     ANY,
@@ -73,7 +67,7 @@ DRAIN_STEP_S: Final = 0.001
 """How long a tick waits for a query that was just taken from the channel."""
 OVERHEAD_BYTES: Final = 1024
 """Overhead that each waiting query adds to the size of its data."""
-TOLD_MAX: Final = 1_000
+LOGGED_MAX: Final = 1_000
 """Number of clients with dropped requests that the log names, each once."""
 SHOWN_CHARACTERS: Final = 200
 """Logged length of a client's name."""
@@ -104,7 +98,7 @@ class ZenohService:
         self._tokens = session.liveliness().declare_subscriber(
             token_key(cell, ANY, ANY), zenoh.handlers.FifoChannel(QUEUED_MAX), history=True
         )
-        self._sights: zenoh.Handler[zenoh.Sample] = self._tokens.handler
+        self._token_events: zenoh.Handler[zenoh.Sample] = self._tokens.handler
         self._queryable = session.declare_queryable(
             queryable_key(cell, host.name), zenoh.handlers.FifoChannel(QUEUED_MAX), complete=True
         )
@@ -112,7 +106,7 @@ class ZenohService:
         # and afterwards have no handler for a thread that starts late.
         self._inbox: zenoh.Handler[zenoh.Query] = self._queryable.handler
         self._turns = Turns[_Arrived]()
-        self._told: set[str] = set()
+        self._logged: set[str] = set()
         self._resting = True
         self._drained: threading.Event | None = None
         self._marked: threading.Event | None = None
@@ -126,7 +120,7 @@ class ZenohService:
             for name, run in (
                 ("enact-dispatch", self._dispatch),
                 ("enact-stage", self._stage),
-                ("enact-tokens", self._see),
+                ("enact-tokens", self._watch_tokens),
             )
         ]
         for thread in self._threads:
@@ -201,11 +195,11 @@ class ZenohService:
         """Count a request that did not fit; log each client once."""
         self._host.count("requests_dropped")
         client = client[:SHOWN_CHARACTERS]
-        if client not in self._told and len(self._told) < TOLD_MAX:
-            self._told.add(client)
+        if client not in self._logged and len(self._logged) < LOGGED_MAX:
+            self._logged.add(client)
             _log.warning(
-                "shard %s: too many requests of %s, or of all clients, wait; some were dropped, and"
-                " further ones are only counted",
+                "shard %s: too many requests from %s, or from all clients, are waiting; some were"
+                " dropped, and further ones are only counted",
                 self._host.name,
                 client,
             )
@@ -231,15 +225,14 @@ class ZenohService:
     def _take(self, arrived: _Arrived) -> None:
         query, key, header, payload, burst = arrived
         try:
-            message = decode_request(
-                bytes(header) if header is not None else b"",
-                bytes(payload) if payload is not None else b"",
-            )
+            message = decode_request(bytes_of(header), bytes_of(payload))
             cell, shard, verb, identity = parse_request_key(key)
             if verb != verb_of(message):
-                raise ProtocolError(f"a {verb_of(message)} came on the key of a {verb}")
+                raise ProtocolError(f"a {verb_of(message)} arrived on the key of a {verb}")
             if (ANY in cell or ANY in shard) and type(message) is not Ping:
-                raise ProtocolError(f"a {verb} came to several shards at once; only a ping may")
+                raise ProtocolError(
+                    f"a {verb} was sent to several shards at once; only a ping may be"
+                )
         except Exception as error:  # noqa: BLE001 - every query is answered
             if not isinstance(error, ProtocolError):
                 # A bug in the decoder: a client that triggers it must not stop the dispatcher.
@@ -284,7 +277,7 @@ class ZenohService:
         try:
             self._host.submit(message, call, identity)
         except Exception:  # noqa: BLE001 - these threads serve all clients
-            _log.exception("a %s was not stored", type(message).__name__)
+            _log.exception("a %s could not be handled", type(message).__name__)
             call.drop()
 
     def reply_key(self, query: zenoh.Query) -> zenoh.KeyExpr | str:
@@ -307,11 +300,11 @@ class ZenohService:
         self.senders.heard(_NOTICES)
         self.senders.send(_NOTICES, _Publication(self._publisher, *encode_frame(notice)))
 
-    def _see(self) -> None:
+    def _watch_tokens(self) -> None:
         """Report sessions' tokens to the host, until the subscription ends."""
         try:
             while True:
-                sample = self._sights.recv()
+                sample = self._token_events.recv()
                 identity, session = token_of(str(sample.key_expr))
                 if session:
                     present = sample.kind == zenoh.SampleKind.PUT

@@ -20,10 +20,16 @@ from enact_dist.core.protocol.messages import (
 from enact_dist.core.protocol.records import Compare
 from enact_dist.core.shard.state import ShardSettings
 from enact_dist.errors import LinkError
-from enact_dist.link.client.namesakes import Comparing, Doubts, Serving, moved_places, serving
+from enact_dist.link.client.duplicate_daemons import (
+    Comparing,
+    Doubts,
+    Serving,
+    moved_places,
+    serving,
+)
 from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
 from enact_dist.link.zenoh.discovery import FoundShard
-from enact_dist.operate.doctor_cell import namesakes
+from enact_dist.operate.doctor_cell import duplicate_daemons
 
 COUNT = Aspect("count", int)
 ASK_S = 10.0
@@ -123,7 +129,7 @@ def test_same_daemon_at_another_address_is_no_second_one(begin, free):
         put(cell, "right/a", 1)
         put(cell, "left/a", 2)
         assert "shards_doubted" not in cell.statistics()
-        assert list(namesakes("cell", None, cell.welcomes())) == []
+        assert list(duplicate_daemons("cell", None, cell.welcomes())) == []
     assert len(serving("cell", "left", (first, other), timeout_s=ASK_S)) == 1
 
 
@@ -141,7 +147,7 @@ def test_client_that_hears_of_a_second_daemon_trusts_neither(begin, free):
         assert first in str(refused.value)
         assert second in str(refused.value)
         assert cell.statistics()["shards_doubted"] == 1
-        (finding,) = namesakes("cell", None, cell.welcomes())
+        (finding,) = duplicate_daemons("cell", None, cell.welcomes())
         assert (finding.subject, first in finding.text, second in finding.text) == (
             "shard left",
             True,
@@ -163,7 +169,7 @@ def test_doctor_asks_at_each_place_that_file_and_shards_name(begin, free):
         placement_map=lambda: PlacementMap(1, (ShardEntry("left", (second,)),), ())
     )
     with connect(first) as cell:
-        (finding,) = namesakes("cell", file, cell.welcomes())
+        (finding,) = duplicate_daemons("cell", file, cell.welcomes())
     assert "stop all but the one whose data you want to keep" in finding.remedy
 
 
@@ -200,8 +206,8 @@ def test_daemon_that_restarts_between_two_questions_is_one(monkeypatch):
     def ask(*_, **__):
         return {shard: Pong("left", 1, True, "", 0, next(starts))}
 
-    monkeypatch.setattr("enact_dist.link.client.namesakes.somebody_listens", lambda _: True)
-    monkeypatch.setattr("enact_dist.link.client.namesakes.ask_shards", ask)
+    monkeypatch.setattr("enact_dist.link.client.duplicate_daemons.somebody_listens", lambda _: True)
+    monkeypatch.setattr("enact_dist.link.client.duplicate_daemons.ask_shards", ask)
 
     found = serving("cell", "left", ("tcp/127.0.0.1:1", "tcp/127.0.0.1:2"), timeout_s=ASK_S)
 
@@ -215,7 +221,7 @@ def test_shard_that_ran_twice_is_asked_about_after_one_of_them_was_silent(monkey
     monkeypatch.setattr(Comparing, "AGAIN_S", 0.01)
     monkeypatch.setattr(Comparing, "LATER_S", 0.01)
     monkeypatch.setattr(
-        "enact_dist.link.client.namesakes.serving", lambda *_, **__: next(answers, both)
+        "enact_dist.link.client.duplicate_daemons.serving", lambda *_, **__: next(answers, both)
     )
     told = queue.SimpleQueue()
     comparing = Comparing("cell", told.put)
@@ -267,7 +273,7 @@ def test_running_shards_notice_a_daemon_that_comes_back_beside_its_successor(
         assert "SHARDS RUNNING TWICE: 1" in _state(shown)
     entries = (ShardEntry("left", (first,)), ShardEntry("right", (right,)))
     file = SimpleNamespace(placement_map=lambda: PlacementMap(1, entries, ()))
-    (finding,) = namesakes("cell", file, {})
+    (finding,) = duplicate_daemons("cell", file, {})
     assert (finding.subject, second in finding.text) == ("shard left", True)
 
     successor.stop(drain_s=0.0)

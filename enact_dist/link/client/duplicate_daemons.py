@@ -53,15 +53,9 @@ class Serving:
 def serving(
     cell: str, shard: str, endpoints: Iterable[str], *, timeout_s: float
 ) -> tuple[Serving, ...]:
-    """Ask endpoint by endpoint who serves a shard there; return each daemon once.
+    """Ask endpoint by endpoint which daemon serves a shard there; return each daemon once.
 
-    An invalid endpoint, whatever its origin, is skipped.
-
-    Args:
-        cell: Name of the cell.
-        shard: Name of the shard.
-        endpoints: The endpoints.
-        timeout_s: How long each may take to answer.
+    Invalid endpoints are skipped.  Each of the others has `timeout_s` to answer.
 
     Raises:
         ProtocolError: An answer cannot be read.
@@ -72,7 +66,7 @@ def serving(
             found.setdefault(one.start, one)
     if len(found) < 2:
         return tuple(found.values())
-    # One that restarted between two questions has answered as two: what it was is not there now.
+    # A daemon that restarted between two questions has answered as two; the earlier one is gone.
     again = (_serving_at(cell, shard, one.endpoint, timeout_s) or one for one in found.values())
     return tuple({one.start: one for one in again}.values())
 
@@ -91,15 +85,12 @@ def _serving_at(cell: str, shard: str, endpoint: str, timeout_s: float) -> Servi
     return Serving(endpoint, answer.start, answer.epoch, answer.uptime_ns / 1e9)
 
 
-def told_places(
+def expected_places(
     cell: str, shards: Sequence[ShardEntry], *, timeout_s: float
 ) -> list[tuple[ShardEntry, ...]]:
     """Ask shards of a cell where they expect each shard; return their answers.
 
-    Args:
-        cell: Name of the cell.
-        shards: The shards to ask, with their endpoints.
-        timeout_s: Time limit for all together; slower shards are left out.
+    All together have `timeout_s` to answer; slower shards are left out.
 
     Raises:
         ConfigError: An endpoint cannot be read.
@@ -113,14 +104,14 @@ def told_places(
 
 
 def moved_places(
-    known: Mapping[str, Iterable[str]], told: Iterable[ShardEntry]
+    known: Mapping[str, Iterable[str]], reported: Iterable[ShardEntry]
 ) -> dict[str, list[str]]:
     """Return the shards with an unknown endpoint in some answer, with all their endpoints.
 
     Two answers that share an endpoint mean the same shard with an additional address.
     """
     moved: dict[str, dict[str, None]] = {}
-    for shard, places in told:
+    for shard, places in reported:
         if known.get(shard) and places and not set(known[shard]) & set(places):
             those = moved.setdefault(shard, dict.fromkeys(known[shard]))
             those.update(dict.fromkeys(places))
@@ -144,7 +135,7 @@ class Comparing:
 
     Args:
         cell: Name of the cell.
-        tell: Receives the result.
+        report: Receives the result.
     """
 
     ASK_S: Final = 0.5
@@ -154,10 +145,10 @@ class Comparing:
     LATER_S: Final = 30.0
     """Pause before the next check, once only one of them answers."""
 
-    def __init__(self, cell: str, tell: Callable[[Served], None]) -> None:
-        self._cell, self._tell = cell, tell
+    def __init__(self, cell: str, report: Callable[[Served], None]) -> None:
+        self._cell, self._report = cell, report
         self._asked: dict[str, Compare] = {}
-        self._doubled: dict[str, Compare] = {}
+        self._doubled: set[str] = set()
         self._were_doubled: dict[str, Compare] = {}
         self._wake = threading.Condition(threading.Lock())
         self._thread: threading.Thread | None = None
@@ -174,7 +165,9 @@ class Comparing:
                 try:
                     thread.start()
                 except RuntimeError as error:  # no thread available: the next question tries again
-                    _log.warning("endpoints of shard %s not compared: %s", compare.shard, error)
+                    _log.warning(
+                        "cannot compare the endpoints of shard %s: %s", compare.shard, error
+                    )
                     return
                 self._thread = thread
             self._wake.notify()
@@ -185,19 +178,20 @@ class Comparing:
                 found = serving(self._cell, compare.shard, compare.places, timeout_s=self.ASK_S)
             except Exception as error:  # noqa: BLE001 - a place from a configuration may be anything
                 if not self._closed:
-                    _log.warning("endpoints of shard %s not compared: %s", compare.shard, error)
+                    _log.warning(
+                        "cannot compare the endpoints of shard %s: %s", compare.shard, error
+                    )
                 continue
+            doubled = len(found) > 1
             with self._wake:
-                self._doubled.pop(compare.shard, None)
-                if len(found) > 1:
-                    self._doubled[compare.shard] = compare
-                if compare.shard in self._were_doubled or len(found) > 1:
+                (self._doubled.add if doubled else self._doubled.discard)(compare.shard)
+                if doubled or compare.shard in self._were_doubled:
                     self._were_doubled[compare.shard] = compare
                 if self._closed:
                     return
             starts = tuple(sorted(one.start for one in found))
-            text = two_daemons(self._cell, compare.shard, found) if len(found) > 1 else ""
-            self._tell(Served(compare.shard, starts, text))
+            text = two_daemons(self._cell, compare.shard, found) if doubled else ""
+            self._report(Served(compare.shard, starts, text))
 
     def _next(self) -> Compare | None:
         """Wait for a question; return None at the end."""
@@ -209,7 +203,7 @@ class Comparing:
             return None if self._closed else self._asked.pop(next(iter(self._asked)))
 
     def close(self, join_s: float = 0.5) -> None:
-        """Ask no more; wait up to `timeout_s` for a check in progress.  Idempotent."""
+        """Ask no more; wait up to `join_s` for a check in progress.  Idempotent."""
         with self._wake:
             self._closed = True
             thread = self._thread
@@ -245,9 +239,9 @@ class Doubts:
         shards = tuple(shards)
         moved = moved_places(self._known, shards)
         wrong = [text for shard, places in moved.items() if (text := self._ask(shard, places))]
-        for shard, told in shards:
+        for shard, places in shards:
             known = self._known.setdefault(shard, [])
-            known += [place for place in told if place not in known]
+            known += [place for place in places if place not in known]
         return wrong
 
     def _ask(self, shard: str, places: list[str]) -> str:
