@@ -90,7 +90,8 @@ def parts_of(kinds):
     """Return the parts that the fields of messages consist of, each once, by name."""
     found = {}
     for kind in kinds:
-        for _, of in fields_of(kind):
+        for _, annotation in fields_of(kind):
+            of = annotation
             while isinstance(of, types.UnionType) or typing.get_origin(of) is tuple:
                 of = typing.get_args(of)[0]
             if of not in SCALARS and of is not Datum and of not in found.values():
