@@ -1,12 +1,21 @@
-"""The pages of `enact_dist/docs` are true: their programs run, their links lead somewhere."""
+"""The pages are true: their programs run, their commands exist, their links lead somewhere.
+
+What a block of code needs but a reader does not stands before it in a comment, `<!-- preamble`.
+A block that no test runs says why, `<!-- not run: reason -->`, and is counted here.  Blocks of
+the language `console`, and files that they need, are followed in `tests/e2e/test_pages.py`.
+"""
 
 import re
+import shlex
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
+from enact_dist.cli.main import build_parser
 from enact_dist.config.environment import variable_of, variables_of
 from enact_dist.config.read import load_config
 from enact_dist.config.table import keys_of
@@ -20,31 +29,125 @@ from enact_dist.config.types import (
 )
 
 ROOT = Path(__file__).parents[1]
+README = ROOT / "README.md"
 PAGES = sorted((ROOT / "enact_dist" / "docs").glob("*.md"))
+DEPLOY = sorted((ROOT / "deploy").rglob("*.md"))
+ALL = [README, *PAGES, *DEPLOY]
+FOLLOWED = {"own_cell.md", "cell.md", "operations.md", "own_actors.md", "protocol.md", "drills.md"}
+"""Pages whose consoles are followed in `tests/e2e`."""
+KINDS = {"python", "console", "toml", "sh", "text"}
+_BLOCK = re.compile(
+    r"^(?:<!-- (not run: (?P<reason>[^\n]*?) |preamble\n(?P<preamble>.*?))-->\n)?"
+    r" *```(?P<kind>\w*)(?: (?P<file>\S+))?\n(?P<text>.*?)^ *```$",
+    re.DOTALL | re.MULTILINE,
+)
 
 
-def programs():
-    """Return the Python blocks that are whole programs: they begin with their imports."""
-    for page in PAGES:
-        blocks = re.findall(
-            r"^```python\n(.*?)^```", page.read_text("utf-8"), re.DOTALL | re.MULTILINE
-        )
-        for number, code in enumerate(blocks, 1):
-            if re.match(r"(from|import) ", code):
-                yield pytest.param(code, id=f"{page.name}-{number}")
+class Block(NamedTuple):
+    """A block of code: why it is not run, what precedes it unseen, its language, file and text."""
+
+    page: Path
+    number: int
+    reason: str
+    preamble: str
+    kind: str
+    file: str
+    text: str
+
+    def __str__(self):
+        return f"{self.page.relative_to(ROOT)}-{self.number}"
 
 
-@pytest.mark.parametrize("code", list(programs()))
-def test_program_of_a_page_runs_as_pasted(code):
+def blocks_of(page):
+    """Return all blocks of a page in order."""
+    return [
+        Block(page, number, *(found[part] or "" for part in Block._fields[2:]))
+        for number, found in enumerate(_BLOCK.finditer(page.read_text("utf-8")), 1)
+    ]
+
+
+BLOCKS = [block for page in ALL for block in blocks_of(page)]
+PROGRAMS = [
+    block
+    for block in BLOCKS
+    if block.kind == "python" and not block.file
+    if block.preamble or re.match(r"(from|import) ", block.text)
+]
+
+
+@pytest.mark.parametrize("block", PROGRAMS, ids=str)
+def test_program_of_a_page_runs_as_pasted(block):
     """What it prints stands beside it."""
     done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=120
+        [sys.executable, "-c", block.preamble + block.text],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
     )
-    told = re.findall(r"^ *print\(.*#\s(.*)$", code, re.MULTILINE)
-    assert (done.returncode, done.stdout.splitlines()) == (0, told), done.stderr
+    told = re.findall(r"^ *print\(.*#\s(.*)$", block.text, re.MULTILINE)
+    assert done.returncode == 0, done.stderr
+    assert block.preamble or done.stdout.splitlines() == told
 
 
-@pytest.mark.parametrize("page", [ROOT / "README.md", *PAGES], ids=lambda page: page.name)
+def test_each_block_is_run_or_says_why_not():
+    """A fragment runs with its preamble, or word for word on another page."""
+    run = {block.text for block in PROGRAMS}
+    left = [
+        str(block)
+        for block in BLOCKS
+        if not block.reason
+        if block.kind not in KINDS
+        or (block.kind == "python" and not block.file and block.text not in run)
+        or (block.kind == "console" and block.page.name not in FOLLOWED)
+        or (block.kind == "sh" and block.page != README)
+        or (block.file and block.page.name not in FOLLOWED)
+    ]
+    assert left == [], "blocks that no test runs, and that do not say why"
+    for block in BLOCKS:
+        if block.reason:
+            print(f"not run: {block}: {block.reason}")
+    assert {block.kind for block in BLOCKS if block.reason} <= {"sh", "console"}
+
+
+def commands_of(block):
+    """Yield the `enact` commands of a block, each as words up to a pipe or an end."""
+    for line in block.text.splitlines():
+        if block.kind == "console" and not line.startswith("$ "):
+            continue
+        for part in re.split(
+            r"&&|[;|&]|\$\(|\b(?:until|time|on_a|on_b|do)\b", line.removeprefix("$ ")
+        ):
+            command = re.sub(r"\d?> ?\S+|\)$", "", part).strip()
+            if command.startswith("enact "):
+                words = shlex.split(command.partition(" -- ")[0], comments=True)
+                yield words[1:]
+
+
+@pytest.mark.parametrize("page", ALL, ids=lambda page: str(page.relative_to(ROOT)))
+def test_commands_of_a_page_have_the_words_and_options_that_there_are(page, capsys):
+    """Also those of blocks that are not run."""
+    wrong = []
+    for block in blocks_of(page):
+        for words in commands_of(block) if block.kind in ("sh", "console") else ():
+            try:
+                build_parser().parse_args(words)
+            except SystemExit:
+                wrong.append((str(block), words, capsys.readouterr().err[-300:]))
+    assert wrong == []
+
+
+@pytest.mark.parametrize("block", [block for block in BLOCKS if block.kind == "toml"], ids=str)
+def test_toml_of_a_page_can_be_read(block, tmp_path):
+    """What has shards is a cell, unless the page shows what is wrong with it."""
+    there = tomllib.loads(re.sub("^  ", "", block.text, flags=re.MULTILINE))
+    if "shards" in there and block.file != "misspelt.toml":
+        (tmp_path / "cell.toml").write_text(block.text, "utf-8")
+        load_config(tmp_path / "cell.toml", environment={})
+
+
+@pytest.mark.parametrize("page", ALL, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_of_a_page_lead_to_files_and_headings(page):
     """Links to other sites are not followed."""
     for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text("utf-8")):
@@ -59,14 +162,30 @@ def test_links_of_a_page_lead_to_files_and_headings(page):
             assert anchor in names, target
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_a_page_opens_with_whom_it_is_for(page):
+    """One sentence below the heading says for whom it is, and what it has."""
+    heading, empty, opening, *_ = page.read_text("utf-8").splitlines()
+    assert heading.startswith("# ")
+    assert empty == ""
+    assert opening.startswith("For those who "), opening
+
+
+def test_help_and_errors_name_pages_that_there_are():
+    """Wherever the program points to a page."""
+    for file in (ROOT / "enact_dist").rglob("*.py"):
+        for named in re.findall(r"(?:enact_dist/docs|deploy)/\w+\.md", file.read_text("utf-8")):
+            assert (ROOT / named).exists(), f"{file}: {named}"
+
+
 def test_readme_is_short():
     """One reads it whole; what serves one purpose only has its own page."""
-    assert len((ROOT / "README.md").read_text("utf-8").splitlines()) <= 200
+    assert len(README.read_text("utf-8").splitlines()) <= 200
 
 
 def test_readme_leads_to_each_page():
     """No reader finds a page that nothing leads to."""
-    readme = (ROOT / "README.md").read_text("utf-8")
+    readme = README.read_text("utf-8")
     assert [page.name for page in PAGES if f"enact_dist/docs/{page.name}" not in readme] == []
 
 

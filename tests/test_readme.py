@@ -17,7 +17,7 @@ def blocks(language):
 
 def test_first_block_is_exactly_two_commands_that_exist():
     """A newcomer types two lines, and both are executable files of the clone."""
-    commands = blocks("")[0].split()
+    commands = blocks("sh")[0].split()
     assert commands == ["./deploy/demo", "./deploy/test"]
     for command in commands:
         assert os.access(ROOT / command, os.X_OK)
@@ -37,7 +37,7 @@ def test_example_runs_as_pasted():
 
 def test_named_paths_exist():
     """Each file and folder of the tree in the README is there."""
-    tree = next(block for block in blocks("") if block.startswith("enact_dist/"))
+    tree = next(block for block in blocks("text") if block.startswith("enact_dist/"))
     folder = ROOT
     for line in tree.splitlines():
         names = line.split("  ")[0] if not line.startswith(" ") else line.strip().split("   ")[0]
@@ -51,7 +51,7 @@ def test_named_paths_exist():
 
 def test_verbs_of_the_command_line_exist():
     """Every noun and verb that the README lists answers to --help."""
-    listed = next(block for block in blocks("") if block.startswith("enact up"))
+    listed = next(block for block in blocks("text") if block.startswith("enact up"))
     for noun, verbs in re.findall(r"enact (\w+) ([\w|-]+\|[\w|-]+)", listed):
         for verb in verbs.split("|"):
             done = subprocess.run(

@@ -19,7 +19,7 @@ def own(engine, images):
 
 
 def test_an_actor_of_ones_own_commits(own):
-    """As deploy/own/README.md calls it: built on enact-core, run, and looked at from a container."""
+    """As the page on own actors calls it: built on enact-core, run, and looked at from a container."""
 
     def log():
         return own.compose(*FILE, "logs", check=False).stdout[-3000:]

@@ -24,7 +24,7 @@ def text(name):
 
 
 def test_its_actors_fit_its_cell():
-    """As `enact actor check` says in that folder, the first line of its page."""
+    """As `enact actor check` prints it in that folder."""
     done = subprocess.run(
         [sys.executable, "-m", "enact_dist.cli.main", "actor", "check"],
         cwd=OWN,
@@ -57,7 +57,8 @@ def test_image_and_unit_look_for_modules_in_the_same_folder():
     assert f"ENV PYTHONPATH={FOLDER}\n" in text("Dockerfile")
     assert f"COPY *.py {FOLDER}/\n" in text("Dockerfile")
     assert f"Environment=PYTHONPATH={FOLDER}\n" in DROP_IN.read_text("utf-8")
-    assert f"install -D -m 644 -t {FOLDER} deploy/own/own_actors.py\n" in text("README.md")
+    page = (ROOT / "enact_dist" / "docs" / "own_actors.md").read_text("utf-8")
+    assert f"install -D -m 644 -t {FOLDER} deploy/own/own_actors.py\n" in page
 
 
 @pytest.fixture

@@ -3,7 +3,8 @@
 A block of code whose first line names a file (```python devices.py) is that file.  A block of the
 language `console` is a terminal: what follows `$ ` is run by bash in the folder of the files, the
 other lines have to stand in its output in this order, whatever their numbers are; `…` stands for
-anything.  A command that ends with `&` goes on until the end of the page.
+anything.  A command that ends with `&` goes on until the end of the page.  A block behind a comment
+`<!-- not run: … -->` is left out.
 """
 
 import os
@@ -16,6 +17,7 @@ from pathlib import Path
 
 PATIENCE_S = 120.0
 _BLOCK = re.compile(r"^```(\w+)(?: (\S+))?\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+_NOT_RUN = re.compile(r"^<!-- not run: .*? -->\n```.*?^```$", re.DOTALL | re.MULTILINE)
 _NUMBER = re.compile(r"\d+(?:\.\d+)?(?: (?:ms|s|B|kB|MB)\b)?")
 
 
@@ -32,7 +34,7 @@ class Step:
 def steps(page):
     """Return what a page tells its reader to do, in order."""
     found = []
-    for kind, name, text in _BLOCK.findall(page):
+    for kind, name, text in _BLOCK.findall(_NOT_RUN.sub("", page)):
         if name:
             found.append(Step(file=name, text=text))
         for part in re.split(r"^\$ ", text, flags=re.MULTILINE)[1:] if kind == "console" else ():

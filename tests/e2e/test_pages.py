@@ -1,0 +1,47 @@
+"""Pages with a terminal, followed as they stand; the tutorial has its own test beside this one."""
+
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+from guides import Reader, steps
+from ports import free_port
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "enact_dist" / "docs"
+PORT = re.compile(r"127\.0\.0\.1:(\d+)")
+
+
+def follow(page, folder):
+    """Do what a page says in a folder, at ports of its own."""
+    text = page.read_text("utf-8")
+    ports = {port: str(free_port()) for port in sorted(set(PORT.findall(text)))}
+    with Reader(folder, ports) as reader:
+        for step in steps(text):
+            reader.does(step)
+
+
+@pytest.mark.carrier("auto")
+@pytest.mark.parametrize("name", ["protocol", "cell"])
+def test_a_page_does_what_it_says(name, tmp_path):
+    """The client without the library commits; the misspelt cell is refused."""
+    follow(DOCS / f"{name}.md", tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.carrier("auto")
+@pytest.mark.parametrize("page", ["enact_dist/docs/operations.md", "deploy/drills.md"])
+def test_a_long_page_does_what_it_says(page, tmp_path):
+    """Shards are added, backed up and restored; processes are killed and frozen."""
+    follow(ROOT / page, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.carrier("auto")
+def test_the_project_of_ones_own_runs(tmp_path):
+    """From a copy of its folder, as its page says."""
+    shutil.copytree(ROOT / "deploy" / "own", tmp_path, dirs_exist_ok=True)
+    cell = tmp_path / "cell.toml"
+    cell.write_text(cell.read_text("utf-8").replace("7490", str(free_port())), "utf-8")
+    follow(DOCS / "own_actors.md", tmp_path)
