@@ -22,11 +22,9 @@ import msgpack
 
 from enact_dist.core.protocol.records import Recovered, SlotRecord
 from enact_dist.link.folder.blobs import Blob, BlobFolder, DamagedBlobError, Mapped
-from enact_dist.link.folder.folder import DATABASE_FILE, Found, check_reach, has_blobs, refuse
-from enact_dist.link.store.database import Database, DatabaseRow, is_damage
+from enact_dist.link.folder.folder import refuse
 from enact_dist.link.store.fields import DamagedRowError
 from enact_dist.link.store.rows import (
-    EPOCH_KEY,
     Key,
     Kind,
     Order,
@@ -53,6 +51,7 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.datum import LockId, Slot
     from enact_dist.core.protocol.messages import Cause
     from enact_dist.core.protocol.records import AuditRecord
+    from enact_dist.link.store.database import Database, DatabaseRow
 
 _UNREADABLE: Final = (
     DamagedRowError,
@@ -109,37 +108,6 @@ class Contents:
     prepared: dict[LockId, tuple[Key, bytes]] = field(default_factory=dict)
     lost: dict[Key, SlotRecord] = field(default_factory=dict)
     batch: int = 0
-
-
-def open_database(folder: Path, found: Found) -> tuple[Database, Contents]:
-    """Open the database and read it completely.
-
-    Raises:
-        StoreError: It is damaged, or lacks acknowledged data.
-        OSError: As the system reports it.
-        sqlite3.Error: As SQLite reports it, except for damage.
-    """
-    path = folder / DATABASE_FILE
-    database = None
-    try:
-        database = Database(path)
-        problems = database.problems(may_be_empty=found.is_first)
-        if problems:
-            refuse(path, f"is damaged: {'; '.join(problems)}")
-        if found.is_first:
-            database.make_table()
-        contents = read_contents(database, path)
-        in_use = contents.ids or not found.is_first or has_blobs(folder)
-        if EPOCH_KEY not in contents.ids and in_use:
-            refuse(path, "holds no epoch: rows are missing")
-        check_reach(folder, found, batch=contents.batch)
-    except BaseException as failure:
-        if database is not None:
-            database.close()
-        if is_damage(failure):
-            refuse(path, f"is damaged: {failure}")
-        raise
-    return database, contents
 
 
 def read_contents(database: Database, path: Path) -> Contents:
