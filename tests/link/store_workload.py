@@ -59,7 +59,7 @@ from enact_dist.core.shard.state import ShardSettings
 from enact_dist.link.folder import mark as store_mark
 from enact_dist.link.folder.blobs import BlobFolder
 from enact_dist.link.folder.mark import MarkFile
-from enact_dist.link.store import store as store_module
+from enact_dist.link.store import medium as store_module
 from enact_dist.link.store.database import Database
 from enact_dist.link.store.states import States
 from enact_dist.link.store.store import open_store
@@ -377,7 +377,7 @@ WRONG = {
     "large bodies are not forced": (BlobFolder, "write", _body_not_forced),
     "the file of a fork is not forced": (BlobFolder, "force", _not_forced_later),
     "a file goes with its first row": (States, "_last", _gone_with_the_first),
-    "a replaced body is unlinked early": (store_module.Store, "_discard", _unlinked_early),
+    "a replaced body is unlinked early": (store_module.FolderMedium, "_discard", _unlinked_early),
     "the mark runs ahead of the disk": (MarkFile, "note", _marked_early),
 }
 """Wrong edits of the store: what they replace, and by what."""

@@ -20,7 +20,8 @@ from enact_dist.core.protocol.records import (
     WorldRecord,
 )
 from enact_dist.errors import StoreError
-from enact_dist.link.folder.folder import moving_mark, refuse_strangers
+from enact_dist.link.folder.folder import refuse_strangers
+from enact_dist.link.folder.marks import moving_mark
 from enact_dist.link.offline import rebalance as module
 from enact_dist.link.offline.rebalance import look, rebalance
 from enact_dist.link.store.store import open_store, read_store

@@ -16,7 +16,7 @@ from store_writer import fill, persist, slot_record, versions
 
 from enact_dist.errors import StoreError
 from enact_dist.link.folder import held_bodies as held_bodies_module
-from enact_dist.link.folder.held_bodies import HELD_FOLDER, held_bodies
+from enact_dist.link.folder.held_bodies import HELD_FOLDER, held_bodies, hold
 from enact_dist.link.folder.lock import FolderLock
 from enact_dist.link.offline import backup as store_copy
 from enact_dist.link.offline import backup_files
@@ -186,8 +186,8 @@ def test_a_damaged_shard_is_not_backed_up(folder, tmp_path):
 
 def test_one_backup_at_a_time(folder, tmp_path):
     """The second is told so, and takes nothing from under the first; nor does a start."""
-    with held_bodies(folder, tmp_path / "first") as bodies:
-        bodies.hold(folder / "blobs")
+    with held_bodies(folder, tmp_path / "first") as held:
+        hold(folder / "blobs", held)
         by = f"by process {os.getpid()} on host .* into {tmp_path / 'first'}; .*wait until it ends"
         with pytest.raises(StoreError, match=f"a backup of .* is in progress, {by}"):
             back_up(folder, tmp_path / "copy", unix_s=1, **NAMES)

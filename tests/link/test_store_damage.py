@@ -16,7 +16,7 @@ from enact_dist.link.folder import mark as store_mark
 from enact_dist.link.folder.folder import DATABASE_FILE
 from enact_dist.link.folder.mark import MARK_FILE
 from enact_dist.link.folder.wal_check import check_wal, commit_ends
-from enact_dist.link.store import store as store_module
+from enact_dist.link.store import medium as store_module
 from enact_dist.link.store.store import open_store, read_store
 from enact_dist.terms import Durability, NullReason
 

@@ -222,14 +222,14 @@ def test_cause_of_several_states_is_stored_once(folder):
         gone = tuple(SlotVersion(slot, 1) for slot in (slots[1:] if left else slots[:1]))
         folder.store.write([persist(HistoryForgotten(gone))])
         folder.reopen()
-        assert folder.store._database._connection.execute(kind).fetchall() == [(left,)]
+        assert folder.store._medium._database._connection.execute(kind).fetchall() == [(left,)]
 
 
 def test_missing_cause_is_refused(folder):
     """A row that another one names is as needed as that one."""
     records = (state(1, cause=CAUSE), state(1, slot=FORK, cause=CAUSE))
     folder.store.write([persist(*records)])
-    folder.store._database._connection.execute("DELETE FROM record WHERE kind = 14")
+    folder.store._medium._database._connection.execute("DELETE FROM record WHERE kind = 14")
     with pytest.raises(StoreError, match="the cause of online:a/aspect is missing"):
         folder.reopen()
 

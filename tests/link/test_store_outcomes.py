@@ -3,7 +3,7 @@
 import tracemalloc
 
 from enact_dist.core.protocol.datum import LockId
-from enact_dist.link.store.rows import Kind, key_of, outcome_key
+from enact_dist.link.store.rows import Kind, key_of
 from enact_dist.link.store.states import OUTCOMES_KEPT_NS, Outcomes
 
 DAY_NS = OUTCOMES_KEPT_NS
@@ -18,7 +18,8 @@ def test_outcomes_of_sessions_that_ended_a_day_ago_are_forgotten_once():
     gone = list(outcomes.expired(DAY_NS + 20))
 
     a, b = (key_of(Kind.ENDED, session) for session in "ab")
-    assert gone == [a, outcome_key("a", 3), b, outcome_key("b", 0)]
+    lanes = [key_of(Kind.OUTCOME, *lane) for lane in (("a", 3), ("b", 0))]
+    assert gone == [a, lanes[0], b, lanes[1]]
     assert list(outcomes.expired(DAY_NS + 20)) == []
     assert list(outcomes.expired(2 * DAY_NS)) == [key_of(Kind.ENDED, "c")]
 

@@ -1,14 +1,14 @@
-"""What the shards of a stopped cell have of some aspects, and which records let it go.
+"""Plans the purge of aspects: what the shards of a stopped cell have of them, and which records go.
 
-All that the shards have stored goes in, a plan comes out.  Rules that a change must keep:
+The input is everything that the shards have stored.  Rules that a change must keep:
 
 - A shard purges a whole aspect in one batch: its registration, all its slots in all contexts
   with their history, and what labels keep of them.
 - Versions are never used twice: on every shard those of an aspect start above all that any shard
   had, and its timestamps after all that it has.
 - A commit over shards that names the aspect and is undecided must not be touched.
-- A run that was cut off goes on where its records are not: a shard that has one let the aspect go,
-  and may have served since; one that was restored from a backup has not, and has none.
+- An interrupted run is completed on shards without its record: one with the record has purged the
+  aspect and may have served since; one that was restored from a backup has neither.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ class Going(NamedTuple):
     Attributes:
         shard: Its name.
         aspect: That of the aspect.
-        type: Fingerprint of the type that it is registered with, "" where it is not.
+        type: Fingerprint of its registered type, "" if it is not registered.
         slots: How many slots of it there are.
         versions: How many states these have, replaced ones included.
         size: Bytes of their data.
-        kept: How many of these versions labels keep.
-        labels: The labels that do.
+        kept: How many of these versions are pinned by labels.
+        labels: These labels.
     """
 
     shard: str
@@ -78,17 +78,17 @@ def planned(
     now_ns: int,
     begun: Mapping[str, int] | None = None,
 ) -> Plan:
-    """Return what is to be done to let aspects go.
+    """Return the plan to purge aspects.
 
     Args:
         stores: What each shard has stored.
-        aspects: Their names.
+        aspects: Names of the aspects.
         now_ns: The wall clock.
-        begun: Those of a run that was cut off, and from which stamp on it let them go.
+        begun: Aspects of an interrupted run, each with the timestamp of its purge.
     """
     begun = begun or {}
     has = {
-        shard: {name for name, at_ns in begun.items() if _has_let_go(stored, name, at_ns)}
+        shard: {name for name, at_ns in begun.items() if _has_purged(stored, name, at_ns)}
         for shard, stored in stores.items()
     }
     done = tuple(name for name in begun if all(name in here for here in has.values()))
@@ -112,8 +112,8 @@ def planned(
     return plan
 
 
-def _has_let_go(stored: Recovered, aspect: str, at_ns: int) -> bool:
-    """Whether a shard has a record by which it let an aspect go, at a stamp or later."""
+def _has_purged(stored: Recovered, aspect: str, at_ns: int) -> bool:
+    """Return whether a shard has purged an aspect, at a timestamp or later."""
     return any(record.name == aspect and record.at_ns >= at_ns for record in stored.forgotten)
 
 
@@ -124,11 +124,11 @@ def _known(stored: Recovered) -> Iterator[str]:
 
 
 def _states(stored: Recovered, aspect: str) -> list[SlotRecord]:
-    return [one for one in (*stored.slots, *stored.history) if one.slot.aspect == aspect]
+    return [state for state in _all_states(stored) if state.slot.aspect == aspect]
 
 
 def _going(shard: str, stored: Recovered, aspect: str) -> Going | None:
-    """Return what a shard has of an aspect, None where it has nothing."""
+    """Return what a shard has of an aspect; None: nothing."""
     entry = next((entry for entry in stored.aspects if entry.name == aspect), None)
     states = _states(stored, aspect)
     kept = [
@@ -152,7 +152,7 @@ def _going(shard: str, stored: Recovered, aspect: str) -> Going | None:
 
 
 def _end(stores: Iterable[Recovered], aspect: str, now_ns: int) -> AspectForgotten:
-    """Return the record by which every shard lets an aspect go: later than any before it."""
+    """Return the record by which every shard purges an aspect: later than any before it."""
     base, at_ns = 0, now_ns
     for stored in stores:
         before = [record for record in stored.forgotten if record.name == aspect]
@@ -165,18 +165,18 @@ def _end(stores: Iterable[Recovered], aspect: str, now_ns: int) -> AspectForgott
 
 
 def _labels_without(stored: Recovered, aspects: set[str]) -> Iterator[KeptRecord]:
-    """Yield what the labels that keep versions of these aspects keep of others."""
+    """Yield the labels that pin versions of these aspects, with only their other versions."""
     for record in stored.kept:
         left = tuple(one for one in record.versions if one.slot.aspect not in aspects)
         if len(left) < len(record.versions):
             yield KeptRecord(record.label, left)
 
 
-# ---------------------------------------------------------------- what has no data
+# ---------------------------------------------------------------- without data
 
 
 def unused_aspects(stores: Mapping[str, Recovered]) -> tuple[str, ...]:
-    """Return the aspects that are registered and of which no shard has any state."""
+    """Return the registered aspects of which no shard has any state."""
     used = {record.slot.aspect for stored in stores.values() for record in _all_states(stored)} | {
         aspect for stored in stores.values() for one in stored.prepared for aspect in _named_by(one)
     }
@@ -185,7 +185,7 @@ def unused_aspects(stores: Mapping[str, Recovered]) -> tuple[str, ...]:
 
 
 def unused_worlds(stores: Mapping[str, Recovered], named: Collection[str]) -> tuple[str, ...]:
-    """Return the world contexts without any state, but for forks and those that are `named`."""
+    """Return the world contexts without any state, except forks and those `named`."""
     used = {record.slot.context for stored in stores.values() for record in _all_states(stored)}
     for stored in stores.values():
         used |= {world.name for world in stored.worlds if world.source}
@@ -197,7 +197,7 @@ def unused_worlds(stores: Mapping[str, Recovered], named: Collection[str]) -> tu
 def world_drops(
     stores: Mapping[str, Recovered], worlds: Collection[str]
 ) -> dict[str, tuple[Record, ...]]:
-    """Return by shard the records by which it lets world contexts without data go."""
+    """Return the records by which each shard drops world contexts without data."""
     drops: dict[str, tuple[Record, ...]] = {}
     for shard, stored in stores.items():
         before = {record.name: record for record in stored.dropped}
@@ -212,13 +212,13 @@ def _all_states(stored: Recovered) -> Iterator[SlotRecord]:
     yield from stored.history
 
 
-# ---------------------------------------------------------------- what is in the way
+# ---------------------------------------------------------------- obstacles
 
 
 def _undecided(
     shard: str, stored: Recovered, aspects: frozenset[str], shards: Iterable[str]
 ) -> Iterator[str]:
-    """Yield the commits over shards that name one of these aspects, or may."""
+    """Yield the undecided commits over shards that name, or may name, one of these aspects."""
     remedy = (
         "start all shards of the cell, wait until `enact lock ls` shows it no more (or end it with"
         " `enact lock resolve`), and stop them"

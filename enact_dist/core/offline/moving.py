@@ -1,14 +1,13 @@
-"""Which entities lie on a shard that is not theirs any more, and which records bring them home.
+"""Finds the entities that a stopped cell's placement puts on other shards, and plans their move.
 
-For a cell that is stopped: all that its shards have stored goes in, a plan comes out.  Rules that a
-change must keep:
+The input is everything that the shards have stored.  Rules that a change must keep:
 
 - An entity moves whole: all its slots in all contexts, with history, labels and causes, in one
-  batch of its new shard; then one batch of the old one forgets it.  Cut off between the two, it is
-  on both, and the next plan only lets the old one forget.
-- What all shards must know before the first entity moves, every one of them learns first: contexts,
-  forks, aspects, and above which versions those of dropped contexts and forgotten aspects start.
-- Where that cannot be done without losing something there is no plan, but what stands in the way.
+  batch of its new shard; then one batch of the old shard deletes it.  After an interruption between
+  the two it is on both, and the next plan only deletes it on the old one.
+- Before the first entity moves, every shard learns what all must know: contexts, forks, aspects,
+  and the version floors of dropped contexts and purged aspects.
+- If something would be lost there is no plan, only a list of obstacles.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from enact_dist.core.protocol.records import (
 from enact_dist.core.state.retention import covers, with_larger
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from enact_dist.core.protocol.datum import Slot
     from enact_dist.core.protocol.messages import AspectEntry, PlacementMap
@@ -45,11 +44,11 @@ NAMED_MAX: Final = 5
 
 
 class Move(NamedTuple):
-    """An entity on its way.
+    """The move of one entity.
 
     Attributes:
         entity: Its name.
-        source: The shard that is to forget it.
+        source: The shard that deletes it.
         target: The shard that it belongs to.
         states: How many states of its slots there are, replaced ones included.
         size: Bytes of their data.
@@ -65,11 +64,11 @@ class Move(NamedTuple):
 
 
 class _Start(NamedTuple):
-    """Where slots start again whose context was dropped, or whose aspect was forgotten.
+    """Where slots of a dropped context or purged aspect start again.
 
     Attributes:
-        base: Above this version.
-        at_ns: Up to this stamp nothing is known of an aspect.
+        base: Their versions are above this one.
+        at_ns: Nothing is known of an aspect up to this timestamp.
     """
 
     base: int
@@ -92,12 +91,12 @@ class Plan:
 
 
 class Shards:
-    """What the shards of a stopped cell have stored, by entity.
+    """The content of a stopped cell's shards, by entity.
 
     Args:
-        stores: What each one has stored; shards that leave the cell are among them.
-        placement: Where entities are to live.
-        under_way: Whether a rebalance was cut off; only then may an entity be on two shards.
+        stores: What each shard has stored, including shards that leave the cell.
+        placement: The new placement of entities.
+        under_way: Whether a rebalance was interrupted; only then may an entity be on two shards.
     """
 
     def __init__(
@@ -114,10 +113,10 @@ class Shards:
                 holders = self._states.setdefault(record.slot.entity, {})
                 holders.setdefault(name, {}).setdefault(record.slot, []).append(record)
 
-    # ---------------------------------------------------------------- what is to be done
+    # ---------------------------------------------------------------- the plan
 
     def plan(self) -> Plan:
-        """Return what is to be done, or why it cannot be."""
+        """Return the plan, or the obstacles to one."""
         plan = Plan()
         plan.obstacles += self._undecided()
         for entity in sorted(self._states):
@@ -125,8 +124,12 @@ class Shards:
         worlds, aspects = self._worlds(plan.obstacles), self._aspects(plan.obstacles)
         if plan.obstacles:
             return plan
-        bases = self._bases(self._worlds_dropped(), "context")
-        for shard, found in self._bases(self._aspects_forgotten(), "aspect").items():
+        dropped = self._gone(lambda stored: stored.dropped, lambda name: WorldDropped(name, 0))
+        forgotten = self._gone(
+            lambda stored: stored.forgotten, lambda name: AspectForgotten(name, 0, 0)
+        )
+        bases = self._bases(dropped, "context")
+        for shard, found in self._bases(forgotten, "aspect").items():
             bases[shard] += found
         for shard in (entry.name for entry in self._placement.shards):
             stored = self._stores[shard]
@@ -171,7 +174,7 @@ class Shards:
     # ---------------------------------------------------------------- what all must know
 
     def _worlds(self, obstacles: list[str]) -> list[WorldRecord]:
-        """Return the contexts that some shard has stored; a fork must be whole."""
+        """Return the contexts of all shards; a fork must be complete."""
         worlds: dict[str, WorldRecord] = {}
         for name, stored in self._stores.items():
             for record in stored.worlds:
@@ -191,7 +194,7 @@ class Shards:
         return list(worlds.values())
 
     def _lacks_part(self, shard: str, world: WorldRecord) -> bool:
-        """Whether a shard has no part of a fork and should; a new one should not."""
+        """Return whether a shard lacks its part of a fork; a new shard has none."""
         stored = self._stores[shard]
         had_source = any(record.slot.context == world.source for record in stored.slots) or any(
             record.name in (world.source, world.name) for record in stored.dropped
@@ -221,7 +224,7 @@ class Shards:
         return list(aspects.values())
 
     def _one_type(self, aspect: str, one: str, other: str) -> str:
-        """Return what makes an aspect that differs on two shards the same on both."""
+        """Return the remedy for an aspect that differs between two shards."""
         at_ns = {
             shard: max(
                 (r.at_ns for r in self._stores[shard].forgotten if r.name == aspect), default=0
@@ -236,39 +239,25 @@ class Shards:
             )
         return "start the cell as it was once, with the same cell.toml for all"
 
-    def _worlds_dropped(self) -> Iterator[dict[str, Gone]]:
-        """Yield what each shard knows of each context that any one has dropped."""
-        for name in sorted(
-            {gone.name for stored in self._stores.values() for gone in stored.dropped}
-        ):
-            none = WorldDropped(name, 0)
-            yield {
-                shard: next((gone for gone in stored.dropped if gone.name == name), none)
-                for shard, stored in self._stores.items()
-            }
-
-    def _aspects_forgotten(self) -> Iterator[dict[str, Gone]]:
-        """Yield what each shard knows of each aspect that any one has forgotten."""
-        all_gone = [gone for stored in self._stores.values() for gone in stored.forgotten]
-        for name in sorted({gone.name for gone in all_gone}):
-            none = AspectForgotten(name, 0, 0)
-            yield {
-                shard: next((gone for gone in stored.forgotten if gone.name == name), none)
-                for shard, stored in self._stores.items()
-            }
+    def _gone(
+        self, of: Callable[[Recovered], Iterable[Gone]], never: Callable[[str], Gone]
+    ) -> Iterator[dict[str, Gone]]:
+        """Yield what each shard knows of each context or aspect that is gone on any of them."""
+        known = {shard: {g.name: g for g in of(stored)} for shard, stored in self._stores.items()}
+        for name in sorted({name for here in known.values() for name in here}):
+            yield {shard: here.get(name) or never(name) for shard, here in known.items()}
 
     def _bases(
         self, by_name: Iterable[dict[str, Gone]], part: Literal["context", "aspect"]
     ) -> dict[str, list[Gone]]:
-        """Return how what is gone starts when it is made again: alike everywhere.
+        """Return where slots of what is gone start when it is made again: alike on all shards.
 
-        What was made since began above the base of its own shard, and is known since that one
-        forgot the aspect, and goes on so; the shard that has it before it moves learns it as
-        well, as a run that is cut off may leave it there.
+        Slots made since then started above the floor of their own shard and keep it.  The shard
+        that has them before the move learns that, too: an interrupted run may leave them there.
 
         Args:
-            by_name: What each shard knows of what is gone.
-            part: Which part of a slot its name is.
+            by_name: What each shard knows of each context or aspect that is gone.
+            part: The part of a slot that its name is.
         """
         bases: dict[str, list[Gone]] = {entry.name: [] for entry in self._placement.shards}
         for by_shard in by_name:
@@ -293,7 +282,7 @@ class Shards:
     # ---------------------------------------------------------------- records
 
     def brought(self, target: str, entities: Iterable[str], source: str) -> tuple[Record, ...]:
-        """Return what `target` stores to have these entities, and note that it has."""
+        """Return the records by which `target` gets these entities, and note that it has them."""
         records: list[Record] = []
         files: dict[int, SlotVersion] = {}
         for entity in entities:
@@ -309,7 +298,7 @@ class Shards:
         return tuple(records)
 
     def left(self, source: str, entities: tuple[str, ...]) -> tuple[Record, ...]:
-        """Return what `source` stores to forget these entities, and note that it has."""
+        """Return the records by which `source` deletes these entities, and note that it has."""
         records: list[Record] = [EntitiesMoved(entities)]
         for label, versions in self._kept_of(source, entities).items():
             rest = self._kept[source][label] - versions
@@ -329,7 +318,7 @@ class Shards:
 
 
 def strangers(stored: Recovered, shard: str, placement: PlacementMap) -> list[tuple[str, str]]:
-    """Return the entities that live elsewhere and that a shard has, or may have soon, and where."""
+    """Return the entities that a shard has or has prepared, and the other shard of each."""
     entities = dict.fromkeys(record.slot.entity for record in stored.slots)
     for promise in stored.prepared:
         entities.update((write.slot.entity, None) for write in promise.writes)
@@ -342,7 +331,7 @@ def _start_of(gone: Gone) -> _Start:
 
 
 def _with_starts(gone: Gone, top: _Start, own: Mapping[str, _Start]) -> Gone:
-    """Return what is gone with where its slots start, and those of some entities by themselves."""
+    """Return a record of what is gone: where its slots start, and those of single entities."""
     entities = sorted(own.items())
     if isinstance(gone, WorldDropped):
         bases = tuple((name, start.base) for name, start in entities)
@@ -355,7 +344,7 @@ def _versions(slots: Mapping[Slot, list[SlotRecord]]) -> set[tuple[Slot, int, in
 
 
 def _copied(states: list[SlotRecord], files: dict[int, SlotVersion]) -> Iterator[SlotRecord]:
-    """Yield the states of a slot, oldest first; bytes that were there before are named."""
+    """Yield the states of a slot, oldest first; repeated bytes name their first version."""
     for state in states:
         same_as = None
         if state.datum is not None:

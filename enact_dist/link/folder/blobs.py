@@ -3,6 +3,8 @@
 A database row holds the file's name, length and checksum; a file without a row is garbage, deleted
 at the next start.  So the order is: write the whole file, commit the row, then unlink the row's
 previous file.  Names are independent of the content and never reused (epoch and counter).
+
+Errors of the system pass through as `OSError`.
 """
 
 from __future__ import annotations
@@ -87,9 +89,6 @@ class BlobFolder:
         """Force a file to the disk after it was written; its name needs `sync_names` too.
 
         The first caller that forces the file gets any error of its writeback.
-
-        Raises:
-            OSError: As the system reports it.
         """
         descriptor = os.open(self.folder / blob.name, os.O_RDONLY | os.O_CLOEXEC)
         try:
@@ -99,11 +98,7 @@ class BlobFolder:
         return blob._replace(synced=True)
 
     def sync_names(self) -> None:
-        """Make the names of all files written so far durable.
-
-        Raises:
-            OSError: As the system reports it.
-        """
+        """Make the names of all files written so far durable."""
         sync_folder(self.folder)
 
     def unlink(self, name: str) -> None:
@@ -141,11 +136,7 @@ class BlobFolder:
         return Mapped(body, None if whole else _Check(path, body, blob.crc))
 
     def sweep(self, keep: Iterable[str]) -> int:
-        """Delete blob files and drafts without a row; return how many there were.
-
-        Raises:
-            OSError: As the system reports it.
-        """
+        """Delete blob files and drafts without a row; return how many there were."""
         kept = frozenset(keep)
         orphans = [name for name in self.names() if name not in kept]
         for name in orphans:
@@ -153,11 +144,7 @@ class BlobFolder:
         return len(orphans)
 
     def names(self) -> list[str]:
-        """Return the names of all blob files and drafts; other files are left alone.
-
-        Raises:
-            OSError: As the system reports it.
-        """
+        """Return the names of all blob files and drafts; other files are left alone."""
         return [
             path.name
             for path in self.folder.iterdir()

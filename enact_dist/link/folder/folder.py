@@ -6,10 +6,8 @@ failed check raises a `StoreError` that names the file and the remedy.
 
 from __future__ import annotations
 
-import json
 import logging
 import shutil
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple, NoReturn
 
 from enact_dist.core.offline.moving import NAMED_MAX, strangers
@@ -20,7 +18,6 @@ from enact_dist.link.folder.mark import MARK_FILE, Mark, read_mark
 from enact_dist.link.folder.wal_check import check_wal
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
     from pathlib import Path
 
     from enact_dist.core.protocol.messages import PlacementMap
@@ -31,9 +28,6 @@ LOG_FILE: Final = "store.db-wal"
 BLOB_FOLDER: Final = "blobs"
 ACCEPT_LOSS_FILE: Final = "accept-loss"
 """An operator creates it; the one start that it is meant for deletes it."""
-MOVING_FILE: Final = "moving"
-REBALANCE: Final = "rebalance"
-FORGET: Final = "forget"
 _REFUSED_SUFFIX: Final = ".refused"
 
 _RESTORE: Final = (
@@ -58,69 +52,6 @@ class Found(NamedTuple):
     def is_first(self) -> bool:
         """Whether no earlier start was ever completed: nothing was acknowledged."""
         return self.mark.is_first if self.mark is not None else self.is_new
-
-
-class MovingMark(NamedTuple):
-    """A mark: entities are being moved from or to a folder, or aspects purged.
-
-    Attributes:
-        number: Identifies the run.
-        shards: All shards whose folders take part.
-        aspects: The purged aspects, each with the timestamp from which on; empty for a rebalance.
-    """
-
-    number: str
-    shards: tuple[str, ...]
-    aspects: Mapping[str, int] = MappingProxyType({})
-
-    @property
-    def what(self) -> str:
-        """The operation in progress, for messages."""
-        return f"forgetting {', '.join(self.aspects)}" if self.aspects else "a rebalance"
-
-
-def way_out(mark: MovingMark) -> str:
-    """Return the command that completes an interrupted run."""
-    command = "enact shard rebalance"
-    if mark.aspects:
-        only = " ".join(f"--shard {name}" for name in mark.shards)
-        command = f"enact shard forget {' '.join(mark.aspects)} {only} --yes"
-    return f"let `{command}` finish"
-
-
-def moving_mark(folder: Path) -> MovingMark | None:
-    """Return the mark of an unfinished run over several folders.
-
-    Raises:
-        StoreError: The mark cannot be read.
-    """
-    path = folder / MOVING_FILE
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        shards = tuple(map(str, found["shards"]))
-        if FORGET in found:
-            aspects = {str(name): int(at_ns) for name, at_ns in found["aspects"].items()}
-            return MovingMark(str(found[FORGET]), shards, aspects)
-        return MovingMark(str(found[REBALANCE]), shards)
-    except FileNotFoundError:
-        return None
-    except (ValueError, TypeError, KeyError, AttributeError):
-        refuse(path, "is damaged")
-
-
-def refuse_moving(folder: Path) -> None:
-    """Refuse a folder in an unfinished rebalance or purge.
-
-    Raises:
-        StoreError: A rebalance or a purge is unfinished.
-    """
-    mark = moving_mark(folder)
-    if mark is not None:
-        refuse(
-            folder,
-            f"is in the middle of {mark.what} with those of {', '.join(mark.shards)}",
-            way_out(mark),
-        )
 
 
 def refuse_strangers(folder: Path, stored: Recovered, shard: str, placement: PlacementMap) -> None:

@@ -30,34 +30,16 @@ _HOLDER_FILE: Final = "holder"
 _log = logging.getLogger("enact.store")
 
 
-class HeldBodies:
-    """The links of the one backup in progress of a folder.
-
-    Args:
-        held: The folder of the links.
-    """
-
-    def __init__(self, held: Path) -> None:
-        self._held = held
-
-    def hold(self, blobs: Path) -> None:
-        """Link all files of `blobs` that are not linked yet, to preserve them."""
-        for path in blobs.iterdir():
-            with suppress(FileNotFoundError, FileExistsError):
-                os.link(path, self._held / path.name)
-
-    def has(self, name: str) -> bool:
-        """Return whether a body of this name is linked."""
-        return (self._held / name).exists()
-
-    def path(self, name: str) -> Path:
-        """Return the path of a linked body."""
-        return self._held / name
+def hold(blobs: Path, held: Path) -> None:
+    """Link all files of `blobs` that are not linked in `held` yet."""
+    for path in blobs.iterdir():
+        with suppress(FileNotFoundError, FileExistsError):
+            os.link(path, held / path.name)
 
 
 @contextmanager
-def held_bodies(folder: Path, into: Path) -> Iterator[HeldBodies]:
-    """Preserve the bodies of a shard's folder; remove the links at the end.
+def held_bodies(folder: Path, into: Path) -> Iterator[Path]:
+    """Yield a folder for links that preserve the bodies of a shard's folder; remove it at the end.
 
     Args:
         folder: The shard's folder.
@@ -73,7 +55,7 @@ def held_bodies(folder: Path, into: Path) -> Iterator[HeldBodies]:
             (held / _HOLDER_FILE).write_text(
                 f"process {os.getpid()} on host {socket.gethostname()} into {into.absolute()}"
             )
-            yield HeldBodies(held)
+            yield held
         finally:
             shutil.rmtree(held, ignore_errors=True)
 

@@ -9,6 +9,8 @@ Makes the C library recycle memory blocks as large as a slice.
 By default it requests each block over 128 KiB from the system and returns it at once, so the next
 block touches all its pages for the first time: half the work of a shard that sends 10 MB.  glibc
 adapts after the first long block is freed; with other C libraries this has no effect.
+
+Errors of the system pass through as `OSError`.
 """
 
 from __future__ import annotations
@@ -90,9 +92,6 @@ def plain_memory(size: int, *, ended: Callable[[], None] | None = None) -> Plain
     Args:
         size: How many bytes.
         ended: Called when the last view is gone, as in `map_file`.
-
-    Raises:
-        OSError: As the system reports it.
     """
     protection = mmap.PROT_READ | mmap.PROT_WRITE
     address = _map(None, size, protection, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, -1)
@@ -109,9 +108,6 @@ def map_file(
         size: How many bytes, at least 1.
         writable: Whether the memory may be changed; this needs a descriptor open for writing.
         ended: Called from any thread once the pages are freed; must not raise.
-
-    Raises:
-        OSError: As the system reports it.
     """
     protection = mmap.PROT_READ | (mmap.PROT_WRITE if writable else 0)
     address = _map(None, size, protection, mmap.MAP_SHARED, descriptor)
@@ -119,21 +115,13 @@ def map_file(
 
 
 def map_to_fill(descriptor: int, size: int) -> Pages:
-    """Map a file for writing until `cut_off`; in a forked child the map becomes private at once.
-
-    Raises:
-        OSError: As the system reports it.
-    """
+    """Map a file for writing until `cut_off`; in a forked child the map becomes private at once."""
     pages = _to_fill[descriptor] = map_file(descriptor, size, writable=True)
     return pages
 
 
 def cut_off(pages: Pages, descriptor: int) -> None:
-    """Make a filled map private, and close its file.
-
-    Raises:
-        OSError: As the system reports it.
-    """
+    """Make a filled map private, and close its file."""
     try:
         withdraw(pages, descriptor)
     finally:
@@ -155,9 +143,6 @@ def anonymous_file(size: int) -> int:
     """Return the descriptor of a file without a name, with all of its pages allocated.
 
     The file disappears with its descriptor and maps.
-
-    Raises:
-        OSError: As the system reports it.
     """
     descriptor = os.memfd_create("enact", os.MFD_CLOEXEC)
     try:
@@ -185,9 +170,6 @@ def withdraw(pages: Pages, descriptor: int) -> None:
     """Detach a writable map from its file: later writes to it stay in this process.
 
     Arrays over it keep their content; a stray write neither changes the file nor crashes.
-
-    Raises:
-        OSError: As the system reports it.
     """
     for offset in range(0, pages.size, STEP_BYTES):
         length = min(STEP_BYTES, pages.size - offset)

@@ -52,6 +52,8 @@ _log = logging.getLogger("enact.link")
 class Draft:
     """A payload that this process fills; to be committed by its name, or dropped.
 
+    Errors of the system pass through as `OSError`.
+
     Attributes:
         shard: The shard that stores it.
         file: Its name there; "" if it has none and is committed by its bytes.
@@ -69,9 +71,6 @@ class Draft:
         """Write the parts in order, filling all of it; return the bytes, read-only.
 
         Writing costs half as much as filling a fresh map: this process touches no new page.
-
-        Raises:
-            OSError: As the system reports it.
         """
         offset = 0
         left = [memoryview(part).cast("B") for part in parts]
@@ -85,19 +84,11 @@ class Draft:
         return self.shown()
 
     def shown(self) -> memoryview:
-        """Return the bytes, read-only, in a map that `close` does not detach.
-
-        Raises:
-            OSError: As the system reports it.
-        """
+        """Return the bytes, read-only, in a map that `close` does not detach."""
         return body_of(map_file(self._descriptor, self.size, writable=False)).toreadonly()
 
     def memory(self) -> memoryview:
-        """Return the bytes, writable in place.
-
-        Raises:
-            OSError: As the system reports it.
-        """
+        """Return the bytes, writable in place."""
         self._pages = map_to_fill(self._descriptor, self.size)
         return body_of(self._pages)
 

@@ -22,6 +22,7 @@ import os
 import time
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from enact_dist.errors import StoreError
@@ -32,11 +33,11 @@ from enact_dist.link.folder.folder import (
     LOG_FILE,
     holds_store,
     look_at,
-    refuse_moving,
 )
-from enact_dist.link.folder.held_bodies import HeldBodies, held_bodies
+from enact_dist.link.folder.held_bodies import held_bodies, hold
 from enact_dist.link.folder.lock import FORMAT_FILE, FolderLock, replace_file, sync_folder
 from enact_dist.link.folder.mark import MARK_FILE
+from enact_dist.link.folder.marks import refuse_moving
 from enact_dist.link.folder.wal_check import HEADER_BYTES, check_wal
 from enact_dist.link.offline.backup_files import (
     BACKUP_FILE,
@@ -56,13 +57,12 @@ from enact_dist.link.offline.backup_files import (
     sealed,
     set_modes,
 )
-from enact_dist.link.store.errors import backup_error, store_error
-from enact_dist.link.store.recovery import open_database, put_together, read_blobs
+from enact_dist.link.store.medium import file_in, folder_errors, open_database
+from enact_dist.link.store.recovery import put_together, read_blobs
 from enact_dist.link.store.store import open_store, read_store
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
-    from pathlib import Path
 
     from enact_dist.core.protocol.records import Recovered
 
@@ -119,20 +119,34 @@ def back_up(folder: Path, into: Path, *, cell: str, shard: str, unix_s: int) -> 
     try:
         if into.exists():
             raise _is_there(into)
-        with held_bodies(folder, into) as bodies, partial_folder(into, ".partial") as partial:
-            stored = _copied(folder, bodies, partial)
+        with held_bodies(folder, into) as held, partial_folder(into, ".partial") as partial:
+            stored = _copied(folder, held, partial)
             backup = _told(stored, cell=cell, shard=shard, unix_s=unix_s)
             told = {name: value for name, value in asdict(backup).items() if name != DIGESTS}
             files = digests_of(partial)
-            told[MODES] = _modes(folder, bodies, files)
+            told[MODES] = _modes(folder, held, files)
             replace_file(partial / BACKUP_FILE, sealed(told, files), mode=FILE_MODE)
             read_backup(partial)
             _sync(partial)
             if not _renamed(partial, into):
                 raise _is_there(into)
     except OSError as failure:
-        raise backup_error(folder, into, failure) from failure
+        raise _backup_error(folder, into, failure) from failure
     return backup
+
+
+def _backup_error(folder: Path, into: Path, failure: OSError) -> StoreError:
+    """Return the error that tells an operator about a system error during a backup."""
+    remedy = "name another place with --to that has room and is writable for this user"
+    where = Path(str(getattr(failure, "filename", None) or into))
+    if (file := file_in(into.parent)) is not None:
+        found = f"{file} is a file, not a folder: no backup can be written to {into}"
+    elif where.is_relative_to(folder):
+        found = f"the data of the shard in {folder} cannot be read ({failure})"
+        remedy = "make the backup as the user that runs the shard"
+    else:
+        found = f"the backup cannot be written to {into} ({failure})"
+    return StoreError(f"{found}; {remedy}; the shard is as it was", path=str(where))
 
 
 def _is_there(into: Path) -> StoreError:
@@ -151,28 +165,28 @@ def _renamed(partial: Path, path: Path) -> bool:
     return True
 
 
-def _modes(folder: Path, bodies: HeldBodies, files: Iterable[str]) -> dict[str, str]:
+def _modes(folder: Path, held: Path, files: Iterable[str]) -> dict[str, str]:
     """Return the permissions of a shard's files; it may delete bodies meanwhile."""
     modes = modes_of(folder, (BLOB_FOLDER, *(name for name in files if "/" not in name)))
     for name in files:
         if "/" in name:
-            modes[name] = mode_of(bodies.path(name.rpartition("/")[2]))
+            modes[name] = mode_of(held / name.rpartition("/")[2])
     return modes
 
 
-def _copied(folder: Path, bodies: HeldBodies, partial: Path) -> Recovered:
+def _copied(folder: Path, held: Path, partial: Path) -> Recovered:
     """Copy a state of a folder; return it, with every byte checked."""
     for _ in range(TRIES_MAX):
-        if not _copy_database(folder, bodies, partial):
+        if not _copy_database(folder, held, partial):
             continue
         database, contents = open_database(partial, look_at(partial))
         with closing(database):
             names = {blob.name for blob in contents.states.blobs.values()}
-            if not all(bodies.has(name) for name in names):
+            if not all((held / name).exists() for name in names):
                 continue
             (partial / BLOB_FOLDER).mkdir(mode=FOLDER_MODE, exist_ok=True)
             for name in names:
-                copy_private(bodies.path(name), partial / BLOB_FOLDER / name)
+                copy_private(held / name, partial / BLOB_FOLDER / name)
             blobs = BlobFolder(partial / BLOB_FOLDER, epoch=0)
             read_blobs(contents, blobs, power_cut=False)
             put_together(contents, partial / DATABASE_FILE)
@@ -185,7 +199,7 @@ def _copied(folder: Path, bodies: HeldBodies, partial: Path) -> Recovered:
     )
 
 
-def _copy_database(folder: Path, bodies: HeldBodies, partial: Path) -> bool:
+def _copy_database(folder: Path, held: Path, partial: Path) -> bool:
     """Copy rows and log; return False if the shard restarted its log, so that they do not match."""
     for name in (FORMAT_FILE, MARK_FILE):
         copy_private(folder / name, partial / name)
@@ -193,10 +207,10 @@ def _copy_database(folder: Path, bodies: HeldBodies, partial: Path) -> bool:
     header = _header(log)
     copy_private(folder / DATABASE_FILE, partial / DATABASE_FILE)
     copy.unlink(missing_ok=True)
-    bodies.hold(folder / BLOB_FOLDER)
+    hold(folder / BLOB_FOLDER, held)
     with suppress(FileNotFoundError):
         copy_private(log, copy)
-    bodies.hold(folder / BLOB_FOLDER)
+    hold(folder / BLOB_FOLDER, held)
     if _header(log) != header:
         return False
     if header:
@@ -315,13 +329,11 @@ def restore(
             " the restored shard must start later than anything its clients have seen: set the"
             " clock first"
         )
-    try:
+    with folder_errors(folder):
         if contents.files is not None:
             check_files(source, contents.files)
         with partial_folder(folder, ".restoring") as partial:
             aside = _put(source, contents, partial, folder, unix_s=unix_s, replace=replace)
-    except OSError as failure:
-        raise store_error(folder, failure) from failure
     return backup, aside
 
 

@@ -10,6 +10,8 @@ Copies that only their owner can read, from the first byte on, whatever the umas
 A folder is built beside its destination and renamed when it is complete.  One process at a time
 builds it, under a lock that ends with the process; the next one deletes the remains of a killed
 one.  Some file systems (NFS) cannot lock folders; backups work there without the lock.
+
+Errors of the system pass through as `OSError`.
 """
 
 from __future__ import annotations
@@ -42,11 +44,7 @@ _log = logging.getLogger("enact.store")
 
 
 def copy_private(source: Path, target: Path) -> None:
-    """Copy the bytes of a file to a new one that only its owner may read.
-
-    Raises:
-        OSError: As the system reports it.
-    """
+    """Copy the bytes of a file to a new one that only its owner may read."""
     target.touch(mode=FILE_MODE)
     shutil.copyfile(source, target)
 
@@ -142,31 +140,19 @@ class Digest(NamedTuple):
 
 
 def digest_of(path: Path) -> Digest:
-    """Return the digest of a file.
-
-    Raises:
-        OSError: As the system reports it.
-    """
+    """Return the digest of a file."""
     with path.open("rb") as file:
         sha256 = hashlib.file_digest(file, "sha256").hexdigest()
         return Digest(file.tell(), sha256)
 
 
 def digests_of(folder: Path) -> dict[str, Digest]:
-    """Return the digests of all files of a backup, by their path in it.
-
-    Raises:
-        OSError: As the system reports it.
-    """
+    """Return the digests of all files of a backup, by their path in it."""
     return {name: digest_of(folder / name) for name in files_of(folder)}
 
 
 def files_of(folder: Path) -> list[str]:
-    """Return the files of a backup except its description, by their path in it.
-
-    Raises:
-        OSError: As the system reports it.
-    """
+    """Return the files of a backup except its description, by their path in it."""
     names = [name for name in sorted(_PLAIN) if (folder / name).exists()]
     names += sorted(f"{BLOB_FOLDER}/{path.name}" for path in (folder / BLOB_FOLDER).iterdir())
     return names
@@ -189,20 +175,12 @@ def modes_of(folder: Path, names: Iterable[str]) -> dict[str, str]:
 
 
 def mode_of(path: Path) -> str:
-    """Return the permissions of a file or folder, in octal digits.
-
-    Raises:
-        OSError: As the system reports it.
-    """
+    """Return the permissions of a file or folder, in octal digits."""
     return f"{stat.S_IMODE(path.stat().st_mode):o}"
 
 
 def set_modes(folder: Path, modes: dict[str, str]) -> None:
-    """Set the permissions of the named files and folders; the owner always keeps access.
-
-    Raises:
-        OSError: As the system reports it.
-    """
+    """Set the permissions of the named files and folders; the owner always keeps access."""
     for name, mode in reversed(modes.items()):  # the folder itself last
         path = folder / name
         with suppress(FileNotFoundError):

@@ -2,35 +2,29 @@
 
 ::
 
-    all folders locked, opened, checked ─> marked ─> shard by shard: one batch ─> marks removed
+    all folders opened and marked ─> shard by shard: one batch ─> marks removed
 
-Each arrow is durable before the next step, so a later run completes one that was killed anywhere.
-While a folder is marked, no shard starts from it.  If the run is cut off while marks are being set
-or removed, some shards start: with all of their data, or with none of the aspect's.  Each shard's
-data of an aspect go in one batch, so a shard never has a part of them.  Old leases need no waiting:
-a commit under a lock from before the stop is refused, and a shard that starts first waits until
-such leases have ended.
+See `link.offline.cell`.  If the run is cut off while marks are being set or removed, some shards
+start: with all of their data, or with none of the aspect's.  Each shard's data of an aspect go in
+one batch, so a shard never has a part of them.  Old leases need no waiting: a commit under a lock
+from before the stop is refused, and a shard that starts first waits until such leases have ended.
 """
 
 from __future__ import annotations
 
-from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from enact_dist.core.offline.forgetting import planned, unused_aspects, unused_worlds, world_drops
-from enact_dist.core.protocol.records import Persist
-from enact_dist.errors import MisuseError, StoreError
+from enact_dist.errors import MisuseError
 from enact_dist.link.folder.marks import mark, under_way, unmark
-from enact_dist.link.store.store import open_store, read_store
-from enact_dist.terms import Durability
+from enact_dist.link.offline.cell import opened, refuse_obstacles, write
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Mapping
+    from collections.abc import Collection, Iterable, Mapping
     from pathlib import Path
 
     from enact_dist.core.offline.forgetting import Going, Plan
     from enact_dist.core.protocol.records import Recovered
-    from enact_dist.link.store.store import Store
 
 
 class Progress(Protocol):
@@ -93,11 +87,7 @@ def look(
         StoreError: As `forget`.
         MisuseError: As `forget`.
     """
-    with ExitStack() as open_folders:
-        stored: dict[str, Recovered] = {}
-        for name, folder in folders.items():
-            with _of_shard(name):
-                stored[name] = open_folders.enter_context(read_store(folder))
+    with opened(folders) as (_, stored):
         found, _ = _plan(folders, stored, aspects, now_ns=0, unused=unused)
     (progress or _Nobody()).found(found)
     _refuse_unknown(found)
@@ -128,15 +118,7 @@ def forget(
         MisuseError: None of these shards ever knew one of the aspects.
     """
     progress = progress or _Nobody()
-    with ExitStack() as undo:
-        stores: dict[str, Store] = {}
-        stored: dict[str, Recovered] = {}
-        for name, folder in folders.items():
-            progress.act(f"open {name}")
-            with _of_shard(name):
-                opened = open_store(folder, unix_s=now_ns // 1_000_000_000, moving=True)
-            stores[name], stored[name] = opened
-            undo.callback(stores[name].close)
+    with opened(folders, progress.act, unix_s=now_ns // 1_000_000_000) as (stores, stored):
         found, plan = _plan(folders, stored, aspects, now_ns=now_ns, unused=unused)
         progress.found(found)
         _refuse_unknown(found)
@@ -146,13 +128,13 @@ def forget(
             mark(folders, progress.act, at_ns)
         for name, records in plan.records.items():
             progress.act(f"forget on {name}")
-            stores[name].write([Persist(0, records, Durability.DURABLE)])
+            write(stores[name], records)
             progress.act(f"unlink on {name}")
             stores[name].rest()
         unmark(folders, progress.act)
         for name, dropped in world_drops(stored, found.worlds).items():
             progress.act(f"drop on {name}")
-            stores[name].write([Persist(0, dropped, Durability.DURABLE)])
+            write(stores[name], dropped)
     return found
 
 
@@ -175,9 +157,7 @@ def _plan(
         aspects = dict.fromkeys((*aspects, *unused_aspects(stored)))
         worlds = unused_worlds(stored, unused)
     plan = planned(stored, aspects, now_ns=now_ns, begun=begun)
-    if plan.obstacles:
-        more = f"; and {len(plan.obstacles) - 3} more" if len(plan.obstacles) > 3 else ""
-        raise StoreError(f"nothing was forgotten: {'; '.join(plan.obstacles[:3])}{more}")
+    refuse_obstacles("nothing was forgotten", plan.obstacles)
     known = plan.known | begun.keys()  # a restore may have removed all traces of the run
     return Forgotten(plan.names, known, plan.going, bool(begun), plan.done, worlds), plan
 
@@ -199,12 +179,3 @@ def _refuse_unknown(found: Forgotten) -> None:
             f"no shard here has an aspect {', '.join(unknown)} (known:"
             f" {', '.join(sorted(found.known)) or 'none'}); nothing was forgotten"
         )
-
-
-@contextmanager
-def _of_shard(name: str) -> Iterator[None]:
-    """Add the shard's name to errors about its folder."""
-    try:
-        yield
-    except StoreError as error:
-        raise StoreError(f"shard {name}: {error}", path=error.path) from error

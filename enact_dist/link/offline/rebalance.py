@@ -2,11 +2,10 @@
 
 ::
 
-    all folders locked, opened, checked ─> marked ─> epochs raised ─> shared records copied
+    all folders opened and marked ─> epochs raised ─> shared records copied
       ─> batch by batch: the new shard has it durably ─> the old one forgets it ─> marks removed
 
-Each arrow is durable before the next step, so a later run completes one that was killed anywhere.
-While a folder is marked, no shard starts from it.  Rules that a change must keep:
+See `link.offline.cell`.  Rules that a change must keep:
 
 - Before anything moves, all epochs rise above the highest one: an entity's fencing numbers then
   grow on its new shard too, and no client confuses old and new versions.
@@ -17,23 +16,18 @@ While a folder is marked, no shard starts from it.  Rules that a change must kee
 from __future__ import annotations
 
 import time
-from contextlib import ExitStack
 from itertools import groupby
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 from enact_dist.core.offline.moving import Move, Shards
-from enact_dist.core.protocol.records import Persist
-from enact_dist.errors import StoreError
 from enact_dist.link.folder.marks import mark, under_way, unmark
-from enact_dist.link.store.store import open_store, read_store
-from enact_dist.terms import Durability
+from enact_dist.link.offline.cell import opened, refuse_obstacles, write
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
     from pathlib import Path
 
     from enact_dist.core.protocol.messages import PlacementMap
-    from enact_dist.core.protocol.records import Record, Recovered
     from enact_dist.link.store.store import Store
 
 BATCH_BYTES: Final = 32 << 20
@@ -87,13 +81,10 @@ def look(folders: Mapping[str, Path], placement: PlacementMap) -> Rebalance:
     Raises:
         StoreError: As `rebalance`.
     """
-    with ExitStack() as open_folders:
-        stored = {
-            name: open_folders.enter_context(read_store(folder)) for name, folder in folders.items()
-        }
+    with opened(folders) as (_, stored):
         resumed = bool(under_way(folders))
         plan = Shards(stored, placement, under_way=resumed).plan()
-    _refuse(plan.obstacles)
+    refuse_obstacles("nothing was moved", plan.obstacles)
     return Rebalance(plan.moves, resumed)
 
 
@@ -117,18 +108,12 @@ def rebalance(
             missing, or something would be lost; the message says what to do.
     """
     progress = progress or _Nobody()
-    with ExitStack() as undo:
-        stores: dict[str, Store] = {}
-        stored: dict[str, Recovered] = {}
-        for name, folder in folders.items():
-            progress.act(f"open {name}")
-            stores[name], stored[name] = open_store(folder, unix_s=unix_s, moving=True)
-            undo.callback(stores[name].close)
+    with opened(folders, progress.act, unix_s=unix_s) as (stores, stored):
         locked_s = time.monotonic()
         resumed = bool(under_way(folders))
         shards = Shards(stored, placement, under_way=resumed)
         plan = shards.plan()
-        _refuse(plan.obstacles)
+        refuse_obstacles("nothing was moved", plan.obstacles)
         if plan.moves or plan.first or resumed:
             mark(folders, progress.act)
         if plan.moves or plan.first:
@@ -138,7 +123,7 @@ def rebalance(
                 store.raise_epoch(epoch)
             for name, records in plan.first.items():
                 progress.act(f"tell {name}")
-                _write(stores[name], records)
+                write(stores[name], records)
             _move(shards, plan.moves, stores, progress)
         wait_s = 0.0
         if plan.moves or resumed:
@@ -151,19 +136,17 @@ def rebalance(
 
 
 def _move(
-    shards: Shards,
-    moves: Iterable[Move],
-    stores: Mapping[str, Store],
-    progress: Progress,
+    shards: Shards, moves: Iterable[Move], stores: Mapping[str, Store], progress: Progress
 ) -> None:
     count = size = 0
     for batch in _batches(moves):
-        source, target, entities = batch[0].source, batch[0].target, [m.entity for m in batch]
-        if not batch[0].copied:
-            progress.act(f"copy {entities[0]} to {target}")
-            _write(stores[target], shards.brought(target, entities, source))
-        progress.act(f"forget {entities[0]} on {source}")
-        _write(stores[source], shards.left(source, tuple(entities)))
+        first, entities = batch[0], tuple(move.entity for move in batch)
+        source, target = first.source, first.target
+        if not first.copied:
+            progress.act(f"copy {first.entity} to {target}")
+            write(stores[target], shards.brought(target, entities, source))
+        progress.act(f"forget {first.entity} on {source}")
+        write(stores[source], shards.left(source, entities))
         progress.act(f"unlink on {source}")
         stores[source].rest()
         stores[target].rest()
@@ -184,13 +167,3 @@ def _batches(moves: Iterable[Move]) -> Iterator[list[Move]]:
                 batch, states, size = [], move.states, move.size
             batch.append(move)
         yield batch
-
-
-def _write(store: Store, records: tuple[Record, ...]) -> None:
-    store.write([Persist(0, records, Durability.DURABLE)])
-
-
-def _refuse(obstacles: list[str]) -> None:
-    if obstacles:
-        more = f"; and {len(obstacles) - 3} more" if len(obstacles) > 3 else ""
-        raise StoreError(f"nothing was moved: {'; '.join(obstacles[:3])}{more}")

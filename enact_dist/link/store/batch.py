@@ -15,10 +15,8 @@ from enact_dist.core.protocol.records import (
     AuditRecord,
     BasesMoved,
     DecisionDone,
-    DecisionRecord,
     EntitiesMoved,
     ForcedEnded,
-    ForcedRecord,
     HistoryForgotten,
     KeptRecord,
     OutcomeRecord,
@@ -28,37 +26,20 @@ from enact_dist.core.protocol.records import (
     SessionRecord,
     SlotRecord,
     WorldDropped,
-    WorldRecord,
 )
 from enact_dist.link.folder.blobs import Blob
-from enact_dist.link.store.prepared import (
-    decision_key,
-    decision_row,
-    forced_key,
-    forced_row,
-    prepared_key,
-    prepared_row,
-    prepared_writes,
-)
 from enact_dist.link.store.rows import (
     INLINE_BYTES_MAX,
     Key,
     Kind,
     Order,
-    aspect_row,
-    audit_row,
     cause_body,
     cause_key,
-    dropped_row,
-    ended_row,
-    forgotten_row,
-    kept_row,
     key_of,
-    outcome_row,
-    session_row,
+    prepared_writes,
+    row_of,
     slot_body,
     slot_key,
-    world_row,
 )
 from enact_dist.link.store.states import State, States
 from enact_dist.terms import Durability
@@ -67,7 +48,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from enact_dist.core.protocol.datum import LockId, Slot
-    from enact_dist.core.protocol.messages import Cause
+    from enact_dist.core.protocol.messages import AspectEntry, Cause
     from enact_dist.core.protocol.records import Persist, Record
     from enact_dist.link.folder.blobs import BlobFolder
     from enact_dist.link.store.states import Outcomes
@@ -144,6 +125,10 @@ class Batch:
                     self._prepare(record, durable=durable)
                 case PreparedEnded():
                     self._end_prepared(record.lock)
+                case AspectRecord():
+                    self._put(record.entry)
+                case BasesMoved():
+                    self._put(record.base)
                 case _:
                     self._put(record)
 
@@ -178,14 +163,12 @@ class Batch:
     def _drop(self, record: WorldDropped) -> None:
         self.changes[key_of(Kind.WORLD, record.name)] = None
         self._remove_slots(lambda slot: slot.context == record.name)
-        key, body = dropped_row(record)
-        self.changes[key] = body
+        self._put(record)
 
     def _forget_aspect(self, record: AspectForgotten) -> None:
         self.changes[key_of(Kind.ASPECT, record.name)] = None
         self._remove_slots(lambda slot: slot.aspect == record.name)
-        key, body = forgotten_row(record)
-        self.changes[key] = body
+        self._put(record)
 
     def _move_out(self, entities: frozenset[str]) -> None:
         self._remove_slots(lambda slot: slot.entity in entities)
@@ -217,15 +200,14 @@ class Batch:
     def _prepare(self, record: PreparedRecord, *, durable: bool) -> None:
         for key in self._states.prepared.pop(record.lock, ()):
             self._remove(key)
-        key, body = prepared_row(record)
-        self.changes[key] = body
+        self._put(record)
         writes = dict(prepared_writes(record))
         self._states.prepared[record.lock] = writes
         self._staged.update((key, _Staged(write, durable)) for key, write in writes.items())
 
     def _end_prepared(self, lock: LockId) -> None:
         """Delete a prepared lock; the slots that it has set take over its files."""
-        self.changes[prepared_key(lock)] = None
+        self.changes[key_of(Kind.PREPARED, *lock)] = None
         for key, write in self._states.prepared.pop(lock, {}).items():
             newest = self._states.newest.get(write.slot)
             staged = self._staged.get(newest.key) if newest is not None else None
@@ -235,52 +217,28 @@ class Batch:
 
     # ---------------------------------------------------------------- everything else
 
-    def _put(self, record: Record) -> None:
-        """Record the change of a record that concerns at most one row."""
-        body: bytes | None
+    def _put(self, record: Record | AspectEntry) -> None:
+        """Record the change of a record's own row."""
         match record:
-            case SessionRecord():
-                if self._outcomes.came_back(record.session):
-                    self.changes[key_of(Kind.ENDED, record.session)] = None
-                key, body = session_row(record)
-            case SessionEnded():
-                self.changes[key_of(Kind.SESSION, record.session)] = None
-                self._forget_ended(record.wall_ns)
-                self._outcomes.ended(record.session, record.wall_ns)
-                key, body = ended_row(record)
-            case OutcomeRecord():
-                self._outcomes.add(record.lock)
-                key, body = outcome_row(record)
-            case WorldRecord():
-                key, body = world_row(record)
-            case BasesMoved(base=AspectForgotten() as base):
-                key, body = forgotten_row(base)
-            case BasesMoved(base=WorldDropped() as base):
-                key, body = dropped_row(base)
-            case AspectRecord():
-                key, body = aspect_row(record.entry)
-            case KeptRecord():
-                key, body = kept_row(record)
-            case DecisionRecord():
-                key, body = decision_row(record)
-            case ForcedRecord():
-                key, body = forced_row(record)
-            case AuditRecord():
-                key, body = audit_row(record, self._next())
             case DecisionDone():
-                self.changes[decision_key(record.lock)] = None
+                self.changes[key_of(Kind.DECISION, *record.lock)] = None
                 return
             case ForcedEnded():
-                self.changes[forced_key(record.lock)] = None
+                self.changes[key_of(Kind.FORCED, *record.lock)] = None
                 return
-            case _:
-                raise TypeError(f"not a record of a store: {record!r}")
-        self.changes[key] = body
-
-    def _forget_ended(self, wall_ns: int) -> None:
-        """Delete the outcomes of sessions that ended long before `wall_ns`."""
-        for key in self._outcomes.expired(wall_ns):
-            self.changes[key] = None
+            case SessionRecord() if self._outcomes.came_back(record.session):
+                self.changes[key_of(Kind.ENDED, record.session)] = None
+            case SessionEnded():
+                self.changes[key_of(Kind.SESSION, record.session)] = None
+                self.changes.update(dict.fromkeys(self._outcomes.expired(record.wall_ns)))
+                self._outcomes.ended(record.session, record.wall_ns)
+            case OutcomeRecord():
+                self._outcomes.add(record.lock)
+        key, body = row_of(record)
+        if isinstance(record, AuditRecord):
+            key = key_of(Kind.AUDIT, *self._next())
+        gone = isinstance(record, KeptRecord) and not record.versions
+        self.changes[key] = None if gone else body
 
     def _next(self) -> Order:
         self._count += 1

@@ -1,19 +1,37 @@
-"""The elements of rows: msgpack lists, read field by field, and parts shared by many rows.
+"""The stored form of a type: a msgpack list whose fields follow the annotations of the type.
 
+A `Slot`, `LockId` or `Position` takes one field for each of its own; any other tuple is one field.
 Reading is strict: anything other than what is written here is damage, not a default.
 """
 
 from __future__ import annotations
 
 import reprlib
-from typing import TypeVar
+from operator import attrgetter
+from types import UnionType
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Final,
+    Generic,
+    NamedTuple,
+    NoReturn,
+    TypeVar,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import msgpack
 
-from enact_dist.core.protocol.datum import LockId, Slot, Token
-from enact_dist.core.protocol.messages import Cause, DatumRead, SlotVersion
+from enact_dist.core.protocol.datum import LockId, Position, Slot
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
 
 T = TypeVar("T")
+_SPREAD: Final = (Slot, LockId, Position)
+_AS_THEY_ARE: Final = (str, int, bytes, bool, type(None))
 
 
 class DamagedRowError(Exception):
@@ -26,98 +44,168 @@ def pack(value: object) -> bytes:
     return packed
 
 
-class Fields:
-    """The fields of a packed list, each read with its type, in order and to the end."""
+def unpack(packed: bytes) -> list[Any]:
+    """Return a stored list.
 
-    __slots__ = ("_fields", "_next")
+    Raises:
+        DamagedRowError: It is none; what msgpack cannot read raises its own errors.
+    """
+    fields = msgpack.unpackb(packed)
+    _expect(fields, (list,))
+    return list(fields)
 
-    def __init__(self, packed: object) -> None:
-        fields = msgpack.unpackb(packed) if isinstance(packed, bytes) else packed
-        if not isinstance(fields, list):
-            raise DamagedRowError(f"a list was expected, found {reprlib.repr(fields)}")
-        self._fields: list[object] = fields
-        self._next = 0
+
+class RowLayout(Generic[T]):
+    """How the values of one type are stored.
+
+    Args:
+        of: A dataclass, named tuple or `tuple[...]` of fixed length.
+        without: An attribute that is not stored: read as its default, or () if others follow.
+        open_end: Whether the last field may be missing; an empty tuple there is not written.
+
+    Attributes:
+        kinds: The types that msgpack shows for each field.
+    """
+
+    def __init__(self, of: type[T], *, without: str = "", open_end: bool = False) -> None:
+        self._make: Callable[..., T] = of
+        self._get: Callable[[Any], Any] = tuple
+        if get_origin(of) is tuple:
+            hints = {str(at): hint for at, hint in enumerate(get_args(of))}
+            self._make = lambda *fields: fields  # type: ignore[assignment]  # the tuple itself
+        else:
+            hints = get_type_hints(of)
+            if without or not issubclass(of, tuple):
+                self._get = attrgetter(*(name for name in hints if name != without))
+        self._gap = [*hints].index(without) if without else len(hints)
+        hints.pop(without, None)
+        parts = [_part(hint) for hint in hints.values()]
+        self.kinds = [kinds for part in parts for kinds in part.kinds]
+        self._least = len(self.kinds) - open_end
+        self._drops_end = open_end and get_origin([*hints.values()][-1]) is tuple
+        writers = [(at, part.write) for at, part in enumerate(parts) if part.write is not None]
+        self._writers = writers[::-1]
+        self._leads = writers == [(0, tuple)]  # most values: entries of causes, reads and writes
+        self._readers = [
+            (at, at + len(part.kinds), part.read)
+            for at, part in enumerate(parts)
+            if part.read is not None
+        ]
 
     @property
-    def empty(self) -> bool:
-        """Whether the list has no fields."""
-        return not self._fields
+    def length(self) -> int:
+        """How many fields there are at most."""
+        return len(self.kinds)
 
     @property
-    def at_end(self) -> bool:
-        """Whether all fields were read."""
-        return self._next == len(self._fields)
+    def is_plain(self) -> bool:
+        """Whether the values are packed as they are."""
+        return not self._writers and not self._drops_end
 
-    def next(self, asked: type[T]) -> T:
-        """Read the next field, which must be of this type."""
-        if self._next >= len(self._fields):
-            raise DamagedRowError(
-                f"field {self._next + 1} of {reprlib.repr(self._fields)} is missing"
-            )
-        found = self._fields[self._next]
-        if not isinstance(found, asked):
-            raise DamagedRowError(f"{asked.__name__} was expected, found {reprlib.repr(found)}")
-        self._next += 1
-        return found
+    def fields(self, value: T) -> list[Any]:
+        """Return the fields of a value, to be packed."""
+        if self._leads:
+            first, *rest = self._get(value)
+            return [*first, *rest]
+        fields = [*self._get(value)]
+        if self._drops_end and not fields[-1]:
+            fields.pop()
+        for at, write in self._writers:
+            fields[at : at + 1] = write(fields[at])
+        return fields
 
-    def last(self, asked: type[T]) -> T:
-        """Read the next field, which must be the last."""
-        found = self.next(asked)
-        self.end()
-        return found
+    def field(self, value: T) -> tuple[list[Any]]:
+        """Return the one field of a value that is part of another."""
+        return (self.fields(value),)
 
-    def end(self) -> None:
-        """Ensure that no field is left."""
-        if not self.at_end:
-            raise DamagedRowError(f"{reprlib.repr(self._fields)} has more than {self._next} fields")
+    def read(self, fields: list[Any]) -> T:
+        """Return the value with these fields, which are used up.
 
-    def slot(self) -> Slot:
-        """Read the three fields of a slot."""
-        return Slot(self.next(str), self.next(str), self.next(str))
+        Raises:
+            DamagedRowError: They are not those of a value.
+        """
+        count = len(fields)
+        if not self._least <= count <= len(self.kinds) or not all(
+            map(isinstance, fields, self.kinds)
+        ):
+            self._refuse(fields)
+        if self._drops_end and count == len(self.kinds) and not fields[-1]:
+            raise DamagedRowError(f"entries were expected at the end of {reprlib.repr(fields)}")
+        for at, end, read in self._readers:
+            if found := fields[at:end]:
+                fields[at:end] = (read(*found),)
+        if self._gap < len(fields):
+            fields.insert(self._gap, ())
+        return self._make(*fields)
 
-    def lock(self) -> LockId:
-        """Read the three fields of a lock's identity."""
-        return LockId(self.next(str), self.next(int), self.next(int))
-
-    def token(self) -> Token:
-        """Read a field that holds a token."""
-        fields = Fields(self.next(list))
-        return Token(fields.next(int), fields.last(int))
-
-    def versions(self) -> tuple[SlotVersion, ...]:
-        """Read a field that holds versions of slots."""
-        entries = [Fields(entry) for entry in self.next(list)]
-        return tuple(SlotVersion(entry.slot(), entry.last(int)) for entry in entries)
-
-
-def packed_versions(versions: tuple[SlotVersion, ...]) -> list[object]:
-    """Return versions of slots in their stored form."""
-    return [[*entry.slot, entry.version] for entry in versions]
+    def _refuse(self, fields: list[Any]) -> NoReturn:
+        for found, kinds in zip(fields, self.kinds, strict=False):
+            _expect(found, kinds)
+        problem = f"has more than {len(self.kinds)} fields"
+        if len(fields) < self._least:
+            problem = f"lacks field {len(fields) + 1}"
+        raise DamagedRowError(f"{reprlib.repr(fields)} {problem}")
 
 
-def packed_cause(cause: Cause) -> list[object]:
-    """Return a version's cause in its stored form."""
-    return [
-        *cause.lock,
-        cause.kind,
-        cause.actor,
-        cause.host,
-        cause.pid,
-        cause.stamp_ns,
-        cause.held_ns,
-        [[*read.slot, read.version, read.stamp_ns] for read in cause.reads],
-        cause.reads_left_out,
-        packed_versions(cause.writes),
-    ]
+class _Part(NamedTuple):
+    """How one attribute is stored.
+
+    Attributes:
+        kinds: The types that msgpack shows for each of its fields.
+        write: Returns the fields of its value; None: the value is the field.
+        read: Returns the value of its fields; None: likewise.
+    """
+
+    kinds: list[tuple[type, ...]]
+    write: Callable[[Any], Sequence[Any]] | None = None
+    read: Callable[..., Any] | None = None
 
 
-def read_cause(packed: object) -> Cause:
-    """Read a version's cause."""
-    fields = Fields(packed)
-    lock, kind, actor, host = fields.lock(), fields.next(str), fields.next(str), fields.next(str)
-    pid, stamp_ns, held_ns = fields.next(int), fields.next(int), fields.next(int)
-    entries = [Fields(entry) for entry in fields.next(list)]
-    reads = tuple(DatumRead(one.slot(), one.next(int), one.last(int)) for one in entries)
-    left_out, writes = fields.next(int), fields.versions()
-    fields.end()
-    return Cause(lock, kind, actor, host, pid, stamp_ns, held_ns, reads, left_out, writes)
+def _part(hint: Any, *, spread: bool = True) -> _Part:
+    if hint in _AS_THEY_ARE:
+        return _Part([(hint,)])
+    if spread and hint in _SPREAD:
+        return _Part(RowLayout(hint).kinds, tuple, hint)
+    if isinstance(hint, UnionType):
+        return _choice(get_args(hint))
+    if get_origin(hint) is tuple and get_args(hint)[-1] is ...:
+        return _series(_part(get_args(hint)[0], spread=False))
+    layout = RowLayout(hint)
+    return _Part([(list,)], None if layout.is_plain else layout.field, layout.read)
+
+
+def _series(one: _Part) -> _Part:
+    """Return how a tuple of any length is stored."""
+    write, read, (kinds,) = one.write, one.read, one.kinds
+
+    def read_all(found: list[Any]) -> tuple[Any, ...]:
+        for field in found:
+            _expect(field, kinds)
+        return tuple(found if read is None else map(read, found))
+
+    if write is None:
+        return _Part([(list,)], None, read_all)
+    return _Part([(list,)], lambda values: ([write(value)[0] for value in values],), read_all)
+
+
+def _choice(hints: Sequence[Any]) -> _Part:
+    """Return how a value of one of several types is stored; the lengths tell lists apart."""
+    layouts = {hint: RowLayout(hint) for hint in hints if hint not in _AS_THEY_ARE}
+    by_length = {layout.length: layout for layout in layouts.values()}
+    longest = by_length[max(by_length)]
+
+    def write(value: Any) -> Sequence[Any]:
+        layout = layouts.get(type(value))
+        return (value,) if layout is None else layout.field(value)
+
+    def read(found: Any) -> Any:
+        return by_length.get(len(found), longest).read(found) if type(found) is list else found
+
+    kinds = tuple(list if hint in layouts else hint for hint in hints)
+    return _Part([kinds], write, read)
+
+
+def _expect(found: object, kinds: tuple[type, ...]) -> None:
+    if not isinstance(found, kinds):
+        names = " or ".join("a list" if kind is list else kind.__name__ for kind in kinds)
+        raise DamagedRowError(f"{names} was expected, found {reprlib.repr(found)}")

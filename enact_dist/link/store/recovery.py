@@ -22,37 +22,24 @@ import msgpack
 
 from enact_dist.core.protocol.records import Recovered, SlotRecord
 from enact_dist.link.folder.blobs import Blob, BlobFolder, DamagedBlobError, Mapped
-from enact_dist.link.folder.folder import DATABASE_FILE, Found, check_reach, has_blobs, refuse
-from enact_dist.link.store.database import Database, DatabaseRow, is_damage
-from enact_dist.link.store.fields import DamagedRowError, read_cause
-from enact_dist.link.store.prepared import (
-    prepared_writes,
-    read_decision,
-    read_forced,
-    read_lock,
-    read_prepared,
-    read_write_key,
-)
+from enact_dist.link.folder.folder import refuse
+from enact_dist.link.store.fields import DamagedRowError
 from enact_dist.link.store.rows import (
-    EPOCH_KEY,
     Key,
     Kind,
     Order,
     StoredSlot,
     cause_key,
-    read_aspect,
-    read_audit,
-    read_dropped,
-    read_ended,
+    prepared_writes,
+    read_cause,
     read_epoch,
-    read_forgotten,
-    read_kept,
+    read_lock,
     read_order,
-    read_outcome,
-    read_session,
+    read_prepared,
+    read_record,
     read_slot,
     read_slot_key,
-    read_world,
+    read_write_key,
     row_checksum,
 )
 from enact_dist.link.store.states import State, States
@@ -64,6 +51,7 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.datum import LockId, Slot
     from enact_dist.core.protocol.messages import Cause
     from enact_dist.core.protocol.records import AuditRecord
+    from enact_dist.link.store.database import Database, DatabaseRow
 
 _UNREADABLE: Final = (
     DamagedRowError,
@@ -74,6 +62,19 @@ _UNREADABLE: Final = (
     msgpack.UnpackException,
 )
 """Exceptions that mean a damaged row; none of them is a system error."""
+
+_LISTS: Final = {
+    Kind.SESSION: "sessions",
+    Kind.WORLD: "worlds",
+    Kind.DROPPED: "dropped",
+    Kind.ASPECT: "aspects",
+    Kind.FORGOTTEN: "forgotten",
+    Kind.KEPT: "kept",
+    Kind.OUTCOME: "outcomes",
+    Kind.DECISION: "decisions",
+    Kind.FORCED: "forced",
+}
+"""The lists of `Recovered` that rows go to as they are."""
 
 _log = logging.getLogger("enact.store")
 
@@ -109,37 +110,6 @@ class Contents:
     batch: int = 0
 
 
-def open_database(folder: Path, found: Found) -> tuple[Database, Contents]:
-    """Open the database and read it completely.
-
-    Raises:
-        StoreError: It is damaged, or lacks acknowledged data.
-        OSError: As the system reports it.
-        sqlite3.Error: As SQLite reports it, except for damage.
-    """
-    path = folder / DATABASE_FILE
-    database = None
-    try:
-        database = Database(path)
-        problems = database.problems(may_be_empty=found.is_first)
-        if problems:
-            refuse(path, f"is damaged: {'; '.join(problems)}")
-        if found.is_first:
-            database.make_table()
-        contents = read_contents(database, path)
-        in_use = contents.ids or not found.is_first or has_blobs(folder)
-        if EPOCH_KEY not in contents.ids and in_use:
-            refuse(path, "holds no epoch: rows are missing")
-        check_reach(folder, found, batch=contents.batch)
-    except BaseException as failure:
-        if database is not None:
-            database.close()
-        if is_damage(failure):
-            refuse(path, f"is damaged: {failure}")
-        raise
-    return database, contents
-
-
 def read_contents(database: Database, path: Path) -> Contents:
     """Read and check all rows, and separate newest states from history.
 
@@ -171,25 +141,12 @@ def _read_row(row: DatabaseRow, contents: Contents) -> None:
     if contents.ids.setdefault(key, row.id) != row.id:
         raise DamagedRowError(f"it repeats row {contents.ids[key]}")
     contents.batch = max(contents.batch, row.batch)
-    recovered = contents.recovered
     match key.kind:
         case Kind.EPOCH:
-            recovered.epoch = read_epoch(row.body)
-        case Kind.SESSION:
-            recovered.sessions.append(read_session(key, row.body))
+            contents.recovered.epoch = read_epoch(row.body)
         case Kind.ENDED:
-            ended = read_ended(key, row.body)
+            ended = read_record(key, row.body)
             contents.ended[ended.session] = ended.wall_ns
-        case Kind.WORLD:
-            recovered.worlds.append(read_world(key, row.body))
-        case Kind.DROPPED:
-            recovered.dropped.append(read_dropped(key, row.body))
-        case Kind.ASPECT:
-            recovered.aspects.append(read_aspect(key, row.body))
-        case Kind.FORGOTTEN:
-            recovered.forgotten.append(read_forgotten(key, row.body))
-        case Kind.KEPT:
-            recovered.kept.append(read_kept(key, row.body))
         case Kind.SLOT:
             slot, order = read_slot_key(key)
             _take_state(key, read_slot(slot, row.body), contents)
@@ -200,14 +157,10 @@ def _read_row(row: DatabaseRow, contents: Contents) -> None:
             _take_state(key, read_slot(read_write_key(key)[1], row.body), contents)
         case Kind.PREPARED:
             contents.prepared[read_lock(key)] = (key, row.body)
-        case Kind.DECISION:
-            recovered.decisions.append(read_decision(key, row.body))
-        case Kind.OUTCOME:
-            recovered.outcomes.append(read_outcome(key, row.body))
-        case Kind.FORCED:
-            recovered.forced.append(read_forced(key, row.body))
         case Kind.AUDIT:
-            contents.acts[read_order(key)] = read_audit(row.body)
+            contents.acts[read_order(key)] = read_record(key, row.body)
+        case _:
+            getattr(contents.recovered, _LISTS[key.kind]).append(read_record(key, row.body))
 
 
 def _take_state(key: Key, found: StoredSlot, contents: Contents) -> None:

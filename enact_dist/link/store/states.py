@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter, OrderedDict
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from enact_dist.link.store.rows import Key, Kind, key_of, outcome_key
+from enact_dist.link.store.rows import Key, Kind, key_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -61,7 +61,7 @@ class Outcomes:
             del self._ended[session]
             yield key_of(Kind.ENDED, session)
             for lane in self._lanes.pop(session, ()):
-                yield outcome_key(session, lane)
+                yield key_of(Kind.OUTCOME, session, lane)
 
 
 class State(NamedTuple):

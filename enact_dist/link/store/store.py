@@ -14,11 +14,8 @@ Its content after a series of records is defined in `core.offline.ledger`; outco
 sessions are deleted after a day.  When `write` returns, the batch survives `kill -9`; if a
 `Persist` in it is durable, it also survives a power cut, with everything written before.  This
 includes history: a durable version stays durable when it is replaced.  Rules that a change must
-keep:
+keep (and those of `link.store.medium`):
 
-- Order: blob files, the commit of their rows, the mark, then unlinking files without rows.  A file
-  that was forced to the disk is unlinked only once the batch that removed its last row is on the
-  disk too.
 - A durable row names only forced files: an unforced one (a fork of an `os` datum) is forced first,
   which writes what is not yet on the disk and copies nothing.
 - After any error the store is dead: the state of the disk is unknown, and a second `fsync` may
@@ -27,31 +24,16 @@ keep:
 
 from __future__ import annotations
 
-import logging
-import sqlite3
-import stat
 from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.records import Recovered
 from enact_dist.errors import StoreError
-from enact_dist.link.folder.blobs import Blob, BlobFolder
-from enact_dist.link.folder.folder import (
-    ACCEPT_LOSS_FILE,
-    BLOB_FOLDER,
-    DATABASE_FILE,
-    check_log,
-    look_at,
-    refuse_moving,
-)
-from enact_dist.link.folder.held_bodies import let_go_of_killed
-from enact_dist.link.folder.lock import FolderLock, check_format, sync_folder
-from enact_dist.link.folder.mark import MarkFile
-from enact_dist.link.folder.torn_log import cut_torn_commits
+from enact_dist.link.folder.lock import FolderLock
+from enact_dist.link.folder.marks import refuse_moving
 from enact_dist.link.store.batch import Batch
-from enact_dist.link.store.database import Database, DatabaseRow
-from enact_dist.link.store.errors import store_error
-from enact_dist.link.store.recovery import Contents, open_database, put_together, read_blobs
+from enact_dist.link.store.database import DatabaseRow
+from enact_dist.link.store.medium import FolderMedium, folder_errors, read_folder
 from enact_dist.link.store.rows import (
     EPOCH_KEY,
     Key,
@@ -67,13 +49,11 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from enact_dist.core.protocol.records import Persist
+    from enact_dist.link.folder.blobs import Blob
+    from enact_dist.link.store.recovery import Contents
 
-_log = logging.getLogger("enact.store")
-LOG_BYTES: Final = 8 << 20
-"""Approximate size of the log at which it is carried into the database."""
 FOLDER_MODE: Final = 0o700
 """A new data folder is private; an existing one keeps its owner's permissions."""
-_ROW_LOG_BYTES: Final = 8 << 10
 
 
 def open_store(folder: Path, *, unix_s: int, moving: bool = False) -> tuple[Store, Recovered]:
@@ -90,20 +70,25 @@ def open_store(folder: Path, *, unix_s: int, moving: bool = False) -> tuple[Stor
     Raises:
         StoreError: The folder is in use, of another format, damaged, or not writable.
     """
-    try:
+    with folder_errors(folder):
         folder.mkdir(mode=FOLDER_MODE, parents=True, exist_ok=True)
         lock = FolderLock(folder)
-    except OSError as failure:
-        raise store_error(folder, failure) from failure
-    try:
-        if not moving:
-            refuse_moving(folder)
-        return _open_locked(folder, lock, unix_s)
-    except BaseException as failure:
-        lock.close()
-        if isinstance(failure, OSError | sqlite3.Error):
-            raise store_error(folder, failure) from failure
-        raise
+        database = None
+        try:
+            if not moving:
+                refuse_moving(folder)
+            database, contents = read_folder(folder)
+            epoch = contents.recovered.epoch = max(contents.recovered.epoch + 1, unix_s)
+            medium = FolderMedium(folder, lock=lock, database=database, epoch=epoch)
+            medium.begin()
+            store = Store(medium, contents, wall_ns=unix_s * 1_000_000_000)
+            medium.begun(store.batch, (blob.name for blob in contents.states.blobs.values()))
+        except BaseException:
+            if database is not None:
+                database.close()
+            lock.close()
+            raise
+    return store, contents.recovered
 
 
 @contextmanager
@@ -119,99 +104,41 @@ def read_store(folder: Path) -> Iterator[Recovered]:
         yield Recovered(epoch=0)
         return
     with closing(FolderLock(folder)):
-        try:
-            database, contents = _read_locked(folder)
-        except (OSError, sqlite3.Error) as failure:
-            raise store_error(folder, failure) from failure
+        with folder_errors(folder):
+            database, contents = read_folder(folder)
         with closing(database):
             yield contents.recovered
 
 
-def _read_locked(folder: Path) -> tuple[Database, Contents]:
-    found = look_at(folder)
-    check_format(folder, is_new=found.is_new)
-    check_log(folder, power_cut=found.power_cut)
-    if found.is_new:
-        # Before the first byte of the log: only a mark distinguishes a power cut from damage.  An
-        # existing one may be from a start that was killed before the mark was on the disk.
-        MarkFile.open(folder, 0).close()
-        sync_folder(folder)
-    cut_torn_commits(folder, found)
-    database, contents = open_database(folder, found)
-    try:
-        (folder / BLOB_FOLDER).mkdir(mode=folder.stat().st_mode & 0o777 | 0o700, exist_ok=True)
-        blobs = BlobFolder(folder / BLOB_FOLDER, epoch=contents.recovered.epoch)
-        read_blobs(contents, blobs, power_cut=found.power_cut)
-        put_together(contents, folder / DATABASE_FILE)
-    except BaseException:
-        database.close()
-        raise
-    return database, contents
-
-
-def _open_locked(folder: Path, lock: FolderLock, unix_s: int) -> tuple[Store, Recovered]:
-    database, contents = _read_locked(folder)
-    mode = stat.S_IMODE(folder.stat().st_mode)
-    if mode & stat.S_IRWXO:
-        text = "%s is open to every user of this host (mode %o): chmod 700, unless that is wanted"
-        _log.warning(text, folder, mode)
-    let_go_of_killed(folder)
-    try:
-        epoch = contents.recovered.epoch = max(contents.recovered.epoch + 1, unix_s)
-        blobs = BlobFolder(folder / BLOB_FOLDER, epoch=epoch)
-        store = Store(folder, lock=lock, database=database, blobs=blobs, contents=contents)
-        store._begin(contents, wall_ns=unix_s * 1_000_000_000)  # noqa: SLF001 - its constructor
-    except BaseException:
-        database.close()
-        raise
-    return store, contents.recovered
-
-
 class Store:
-    """The open store of one shard; made by `open_store`.  Used by one thread at a time."""
+    """The open store of one shard.  Used by one thread at a time.
 
-    def __init__(
-        self,
-        folder: Path,
-        *,
-        lock: FolderLock,
-        database: Database,
-        blobs: BlobFolder,
-        contents: Contents,
-    ) -> None:
-        self._folder = folder
-        self._lock = lock
-        self._database = database
-        self._blobs = blobs
+    Args:
+        medium: Where its rows and bodies are.
+        contents: What was read from there; `epoch` is the new one, made durable here.
+        wall_ns: The wall clock.
+
+    Attributes:
+        batch: Number of the newest batch.
+    """
+
+    def __init__(self, medium: FolderMedium, contents: Contents, *, wall_ns: int) -> None:
+        self._medium = medium
         self._ids = contents.ids
         self._states = contents.states
         locks = (outcome.lock for outcome in contents.recovered.outcomes)
         self._outcomes = Outcomes(locks, contents.ended)
         self._next_id = max(self._ids.values(), default=0) + 1
-        self._batch = contents.batch
+        self.batch = contents.batch
         self._epoch = contents.recovered.epoch
-        self._mark: MarkFile | None = None
-        self._log_bytes = 0
-        self._rubbish: list[str] = []
-        self._rubbish_once_forced: list[str] = []
         self._failure: BaseException | None = None
         self._closed = False
-
-    def _begin(self, contents: Contents, *, wall_ns: int) -> None:
-        """Make the new epoch durable, and remove remains of the past from the folder."""
-        # A new generation of the log: remains of a torn one must not be taken for damage later.
-        self._database.checkpoint(cut=True)
-        changes: dict[Key, bytes | None] = {EPOCH_KEY: epoch_body(contents.recovered.epoch)}
+        changes: dict[Key, bytes | None] = {EPOCH_KEY: epoch_body(self._epoch)}
         for key, record in contents.lost.items():
             cause = self._states.causes.get(key)
             changes[key] = slot_body(record, None, cause and read_order(cause))
         changes.update(dict.fromkeys(self._outcomes.expired(wall_ns)))
         self._commit(changes, forced=True)
-        self._mark = MarkFile.open(self._folder, self._batch)
-        (self._folder / ACCEPT_LOSS_FILE).unlink(missing_ok=True)
-        sync_folder(self._folder)
-        sync_folder(self._folder.parent)
-        self._blobs.sweep(blob.name for blob in self._states.blobs.values())
 
     # ---------------------------------------------------------------- writing
 
@@ -240,48 +167,43 @@ class Store:
         Raises:
             StoreError: As in `write`.
         """
-        self._guarded(self._rest)
+        self._guarded(self._medium.rest)
 
     def close(self) -> None:
-        """Carry the log into the database and release the folder; idempotent."""
-        if self._closed:
-            return
-        self._closed = True
-        self._database.close()
-        if self._mark is not None:
-            self._mark.close()
-        self._lock.close()
+        """Write what is left and release the medium; idempotent."""
+        if not self._closed:
+            self._closed = True
+            self._medium.close()
 
     def _guarded(self, act: Callable[[], None]) -> None:
+        name = self._medium.name
         if self._closed:
-            raise StoreError(f"the store {self._folder} is closed", path=str(self._folder))
+            raise StoreError(f"the store {name} is closed", path=name)
         if self._failure is not None:
             raise StoreError(
-                f"the store {self._folder} has failed before ({self._failure}) and accepts nothing"
-                " more; restart the shard",
-                path=str(self._folder),
+                f"the store {name} has failed before ({self._failure}) and accepts nothing more;"
+                " restart the shard",
+                path=name,
             )
-        try:
-            act()
-        except BaseException as failure:
-            self._failure = failure
-            if isinstance(failure, OSError | sqlite3.Error):
-                raise store_error(self._folder, failure) from failure
-            raise
+        with self._medium.errors():
+            try:
+                act()
+            except BaseException as failure:
+                self._failure = failure
+                raise
 
     def _write(self, batch: Sequence[Persist]) -> None:
-        gathered = Batch(self._batch + 1, self._states, self._outcomes)
+        gathered = Batch(self.batch + 1, self._states, self._outcomes)
         for persist in batch:
             gathered.take(persist)
-        unnamed = gathered.settle(self._blobs)
+        unnamed = gathered.settle(self._medium.bodies)
         if gathered.changes:
-            self._commit(gathered.changes, forced=gathered.forced)
-        self._discard(unnamed, forced=gathered.forced)
-        if self._log_bytes > 4 * LOG_BYTES:
-            self._rest()
+            self._commit(gathered.changes, unnamed, forced=gathered.forced)
 
-    def _commit(self, changes: dict[Key, bytes | None], *, forced: bool) -> None:
-        self._batch += 1
+    def _commit(
+        self, changes: dict[Key, bytes | None], unnamed: Sequence[Blob] = (), *, forced: bool
+    ) -> None:
+        self.batch += 1
         if all(body is None for body in changes.values()):
             # The newest row shows how far the store got, so a batch must not only delete rows.
             changes[EPOCH_KEY] = epoch_body(self._epoch)
@@ -294,35 +216,12 @@ class Store:
                 continue
             row_id = self._ids.get(key) or self._new_id(free)
             self._ids[key] = row_id
-            crc = row_checksum(key, self._batch, body)
-            rows.append(DatabaseRow(row_id, key.kind, self._batch, key.name, body, crc))
-            self._log_bytes += len(body) + _ROW_LOG_BYTES
-        self._database.commit(rows, free, forced=forced)
-        if self._mark is not None:
-            self._mark.note(self._batch, forced=forced)
+            crc = row_checksum(key, self.batch, body)
+            rows.append(DatabaseRow(row_id, key.kind, self.batch, key.name, body, crc))
+        self._medium.commit(self.batch, rows, free, unnamed, forced=forced)
 
     def _new_id(self, free: list[int]) -> int:
         if free:
             return free.pop()
         self._next_id += 1
         return self._next_id - 1
-
-    # ---------------------------------------------------------------- between batches
-
-    def _discard(self, unnamed: list[Blob], *, forced: bool) -> None:
-        """Record which files can be unlinked now, and which once the log is on the disk."""
-        for blob in unnamed:
-            later = blob.synced and not forced
-            (self._rubbish_once_forced if later else self._rubbish).append(blob.name)
-        if forced:
-            self._rubbish += self._rubbish_once_forced
-            self._rubbish_once_forced.clear()
-
-    def _rest(self) -> None:
-        if self._log_bytes > LOG_BYTES:
-            self._database.checkpoint()
-            self._log_bytes = 0
-            self._discard([], forced=True)
-        for name in self._rubbish:
-            self._blobs.unlink(name)
-        self._rubbish.clear()

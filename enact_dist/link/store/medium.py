@@ -1,0 +1,278 @@
+"""Where the rows and large bodies of a store are kept: a folder, opened, checked and written.
+
+Nothing here knows what rows mean: `link.store.store` commits batches of them, and bodies that are
+written before the rows that name them.  Rules that a change must keep:
+
+- Order: blob files, the commit of their rows, the mark, then unlinking files without rows.  A file
+  that was forced to the disk is unlinked only once the batch that removed its last row is on the
+  disk too.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import sqlite3
+import stat
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.errors import StoreError
+from enact_dist.link.folder.blobs import Blob, BlobFolder
+from enact_dist.link.folder.folder import (
+    ACCEPT_LOSS_FILE,
+    BLOB_FOLDER,
+    DATABASE_FILE,
+    check_log,
+    check_reach,
+    has_blobs,
+    look_at,
+    refuse,
+)
+from enact_dist.link.folder.held_bodies import let_go_of_killed
+from enact_dist.link.folder.lock import check_format, sync_folder
+from enact_dist.link.folder.mark import MarkFile
+from enact_dist.link.folder.torn_log import cut_torn_commits
+from enact_dist.link.store.database import Database, is_damage
+from enact_dist.link.store.recovery import put_together, read_blobs, read_contents
+from enact_dist.link.store.rows import EPOCH_KEY
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+    from contextlib import AbstractContextManager
+    from pathlib import Path
+
+    from enact_dist.link.folder.folder import Found
+    from enact_dist.link.folder.lock import FolderLock
+    from enact_dist.link.store.database import DatabaseRow
+    from enact_dist.link.store.recovery import Contents
+
+LOG_BYTES: Final = 8 << 20
+"""Approximate size of the log at which it is carried into the database."""
+_ROW_LOG_BYTES: Final = 8 << 10
+_FULL_ERRNOS: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+_DENIED_ERRNOS: Final = frozenset({errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR})
+_log = logging.getLogger("enact.store")
+
+
+class FolderMedium:
+    """A folder, locked and read, with the files of a new epoch.  Used by one thread at a time.
+
+    Attributes:
+        name: Where it is, for messages.
+        bodies: Its large bodies.
+    """
+
+    def __init__(self, folder: Path, *, lock: FolderLock, database: Database, epoch: int) -> None:
+        self.name = str(folder)
+        self.bodies = BlobFolder(folder / BLOB_FOLDER, epoch=epoch)
+        self._folder = folder
+        self._lock = lock
+        self._database = database
+        self._mark: MarkFile | None = None
+        self._log_bytes = 0
+        self._rubbish: list[str] = []
+        self._rubbish_once_forced: list[str] = []
+
+    def begin(self) -> None:
+        """Start a new generation of the log: remains of a torn one would later look like damage."""
+        mode = stat.S_IMODE(self._folder.stat().st_mode)
+        if mode & stat.S_IRWXO:
+            text = "%s is open to every user of this host (mode %o): chmod 700, unless intended"
+            _log.warning(text, self._folder, mode)
+        let_go_of_killed(self._folder)
+        self._database.checkpoint(cut=True)
+
+    def begun(self, batch: int, named: Iterable[str]) -> None:
+        """Mark the first batch of the new epoch, and remove remains of the past."""
+        self._mark = MarkFile.open(self._folder, batch)
+        (self._folder / ACCEPT_LOSS_FILE).unlink(missing_ok=True)
+        sync_folder(self._folder)
+        sync_folder(self._folder.parent)
+        self.bodies.sweep(named)
+
+    def commit(
+        self,
+        batch: int,
+        rows: Sequence[DatabaseRow],
+        gone: Iterable[int],
+        unnamed: Iterable[Blob] = (),
+        *,
+        forced: bool,
+    ) -> None:
+        """Put `rows` and delete those with an id in `gone`, atomically.
+
+        Args:
+            batch: Number of this batch.
+            rows: With new bodies.
+            gone: Ids of deleted rows.
+            unnamed: Bodies that no row names any more.
+            forced: Whether everything so far must survive a power cut when this returns.
+        """
+        self._database.commit(rows, gone, forced=forced)
+        if self._mark is not None:
+            self._mark.note(batch, forced=forced)
+        self._log_bytes += sum(len(row.body) + _ROW_LOG_BYTES for row in rows)
+        self._discard(unnamed, forced=forced)
+        if self._log_bytes > 4 * LOG_BYTES:
+            self.rest()
+
+    def _discard(self, unnamed: Iterable[Blob], *, forced: bool) -> None:
+        """Record which files can be unlinked now, and which once the log is on the disk."""
+        for blob in unnamed:
+            later = blob.synced and not forced
+            (self._rubbish_once_forced if later else self._rubbish).append(blob.name)
+        if forced:
+            self._rubbish += self._rubbish_once_forced
+            self._rubbish_once_forced.clear()
+
+    def rest(self) -> None:
+        """Do what can wait until a batch is acknowledged: unlink files, shorten the log."""
+        if self._log_bytes > LOG_BYTES:
+            self._database.checkpoint()
+            self._log_bytes = 0
+            self._discard([], forced=True)
+        for name in self._rubbish:
+            self.bodies.unlink(name)
+        self._rubbish.clear()
+
+    def close(self) -> None:
+        """Carry the log into the database and release the folder; idempotent."""
+        self._database.close()
+        if self._mark is not None:
+            self._mark.close()
+        self._lock.close()
+
+    def errors(self) -> AbstractContextManager[None]:
+        """Return `folder_errors` of this folder."""
+        return folder_errors(self._folder)
+
+
+def read_folder(folder: Path) -> tuple[Database, Contents]:
+    """Read and check a locked folder; see `link.store.recovery`.
+
+    Raises:
+        StoreError: It is damaged, or of another format.
+        OSError: As the system reports it.
+        sqlite3.Error: As SQLite reports it, except for damage.
+    """
+    found = look_at(folder)
+    check_format(folder, is_new=found.is_new)
+    check_log(folder, power_cut=found.power_cut)
+    if found.is_new:
+        # Before the first byte of the log: only a mark distinguishes a power cut from damage.  An
+        # existing one may be from a start that was killed before the mark was on the disk.
+        MarkFile.open(folder, 0).close()
+        sync_folder(folder)
+    cut_torn_commits(folder, found)
+    database, contents = open_database(folder, found)
+    try:
+        (folder / BLOB_FOLDER).mkdir(mode=folder.stat().st_mode & 0o777 | 0o700, exist_ok=True)
+        blobs = BlobFolder(folder / BLOB_FOLDER, epoch=contents.recovered.epoch)
+        read_blobs(contents, blobs, power_cut=found.power_cut)
+        put_together(contents, folder / DATABASE_FILE)
+    except BaseException:
+        database.close()
+        raise
+    return database, contents
+
+
+def open_database(folder: Path, found: Found) -> tuple[Database, Contents]:
+    """Open the database and read it completely.
+
+    Raises:
+        StoreError: It is damaged, or lacks acknowledged data.
+        OSError: As the system reports it.
+        sqlite3.Error: As SQLite reports it, except for damage.
+    """
+    path = folder / DATABASE_FILE
+    database = None
+    try:
+        database = Database(path)
+        problems = database.problems(may_be_empty=found.is_first)
+        if problems:
+            refuse(path, f"is damaged: {'; '.join(problems)}")
+        if found.is_first:
+            database.make_table()
+        contents = read_contents(database, path)
+        in_use = contents.ids or not found.is_first or has_blobs(folder)
+        if EPOCH_KEY not in contents.ids and in_use:
+            refuse(path, "holds no epoch: rows are missing")
+        check_reach(folder, found, batch=contents.batch)
+    except BaseException as failure:
+        if database is not None:
+            database.close()
+        if is_damage(failure):
+            refuse(path, f"is damaged: {failure}")
+        raise
+    return database, contents
+
+
+# ---------------------------------------------------------------- errors of the system
+
+
+@contextmanager
+def folder_errors(folder: Path) -> Iterator[None]:
+    """Raise a `StoreError` that tells an operator what to do about an error of the system.
+
+    Raises:
+        StoreError: In place of an `OSError` or an error of SQLite.
+    """
+    try:
+        yield
+    except (OSError, sqlite3.Error) as failure:
+        raise _store_error(folder, failure) from failure
+
+
+def _store_error(folder: Path, failure: OSError | sqlite3.Error) -> StoreError:
+    """Return the error that tells an operator about a system error."""
+    if (file := file_in(folder)) is not None:
+        return StoreError(
+            f"{file} is a file, not a folder, so a shard cannot keep its data in {folder}; name"
+            " another folder in cell.toml (`folder` of the shard, or `data_folder`), or move the"
+            " file away",
+            path=str(file),
+        )
+    path = str(getattr(failure, "filename", None) or folder)
+    code = getattr(failure, "sqlite_errorcode", 0) & 0xFF
+    number = failure.errno if isinstance(failure, OSError) else None
+    if number in _FULL_ERRNOS or code == sqlite3.SQLITE_FULL:
+        found = f"no room for the data of {folder}: {_free_bytes(folder)} bytes are free there"
+        remedy = "free space on its disk, or raise its quota"
+    elif number == errno.ENOMEM:
+        found = f"the system cannot map all large data of {folder}"
+        remedy = "raise vm.max_map_count (sysctl), or retain fewer versions"
+    elif code in {sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED}:
+        found = f"the database in {folder} is open in another program"
+        remedy = "close that program (a database browser, a backup)"
+    elif number in _DENIED_ERRNOS or code in {sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN}:
+        found = f"{folder} cannot be written by this process"
+        remedy = "let the folder and all in it belong to the user that runs the shard"
+    else:
+        found = f"the disk or file system below {folder} fails"
+        remedy = "check the system's log and repair it"
+    return StoreError(
+        f"{found} ({failure}): {remedy}, and start the shard again; all acknowledged data are kept",
+        path=path,
+    )
+
+
+def file_in(folder: Path) -> Path | None:
+    """Return the file that takes the place of the folder or one of its parents."""
+    for place in (folder, *folder.parents):
+        try:
+            if place.exists():
+                return None if place.is_dir() else place
+        except OSError:
+            return None
+    return None
+
+
+def _free_bytes(folder: Path) -> int | str:
+    """Return how many bytes this process may still write below `folder`."""
+    try:
+        found = os.statvfs(folder)
+    except OSError:
+        return "an unknown number of"
+    return found.f_bavail * found.f_frsize
