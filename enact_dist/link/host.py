@@ -67,7 +67,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from enact_dist.core.protocol.messages import Answer, Notice, Request
-    from enact_dist.core.protocol.records import Effect, Event
+    from enact_dist.core.protocol.records import Call, Event
     from enact_dist.core.shard.state import ShardSettings
     from enact_dist.core.state.clock import Latencies
     from enact_dist.link.memory.shared_folder import SharedFolder
@@ -172,7 +172,7 @@ class ShardHost:
         self._kept_at_once: deque[int] = deque()
         self._watchers: tuple[Callable[[Notice], None], ...] = ()
         self._call: Callable[[str, Request], None] | None = None
-        self._compare: Callable[[Compare], None] | None = None
+        self._compare: Callable[[Compare], None] = lambda _: None
         self._inboxes: tuple[Callable[[], None], ...] = ()
         self._each_tick: tuple[Callable[[], None], ...] = ()
         self._failure: Exception | None = None
@@ -305,7 +305,7 @@ class ShardHost:
         self, call: Callable[[str, Request], None], compare: Callable[[Compare], None] | None = None
     ) -> None:
         """Set the functions that ask other shards; they must not block."""
-        self._call, self._compare = call, compare
+        self._call, self._compare = call, compare or self._compare
 
     def watch(self, watcher: Callable[[Notice], None]) -> Callable[[], None]:
         """Call `watcher` with each notice, in order; return a function that ends this."""
@@ -341,10 +341,27 @@ class ShardHost:
             self._handle_now(message, handle, identity)
 
     def _handle_now(self, message: Request | Event, handle: int, identity: str) -> None:
+        clock, later = self._clock, list[Publish | Story]()
         try:
-            self._perform(self._decide(message, handle, identity))
+            for effect in self._shard.handle(
+                message,
+                reply_to=handle,
+                identity=identity,
+                now_ns=clock.monotonic_ns(),
+                wall_ns=clock.wall_ns(),
+            ):
+                if isinstance(effect, Reply):  # answers first, since clients wait for them
+                    reply = self._replies.pop(effect.reply_to, None)
+                    if reply is not None:
+                        reply(effect.answer)  # type: ignore[arg-type]  # of the core: an `Answer`
+                elif isinstance(effect, _TOLD_LATER):
+                    later.append(effect)
+                else:
+                    self._perform(effect)
+            for told in later:
+                self._tell(told)
             while self._kept_at_once:
-                self._perform(self._decide(Persisted(self._kept_at_once.popleft()), 0))
+                self._handle_now(Persisted(self._kept_at_once.popleft()), 0, "")
             if self._draining and self._shard.idle:
                 self._rests.set()
         except BaseException as failure:
@@ -354,40 +371,23 @@ class ShardHost:
             if not isinstance(failure, Exception):
                 raise
 
-    def _decide(self, message: Request | Event, handle: int, identity: str = "") -> list[Effect]:
-        clock = self._clock
-        return self._shard.handle(
-            message,
-            reply_to=handle,
-            identity=identity,
-            now_ns=clock.monotonic_ns(),
-            wall_ns=clock.wall_ns(),
-        )
+    def _perform(self, effect: Persist | Compare | Call) -> None:
+        """Perform an effect that concerns the store or another shard."""
+        if isinstance(effect, Persist):
+            self._persist(effect)
+        elif isinstance(effect, Compare):
+            self._compare(effect)
+        elif self._call is not None:
+            self._call(effect.shard, cast("Request", effect.request))
 
-    def _perform(self, effects: list[Effect]) -> None:
-        """Perform the shard's effects: answers first, since clients wait for them."""
-        later: list[Publish | Story] = []
-        for effect in effects:
-            if isinstance(effect, Reply):
-                reply = self._replies.pop(effect.reply_to, None)
-                if reply is not None:
-                    reply(effect.answer)  # type: ignore[arg-type]  # of the core: an `Answer`
-            elif isinstance(effect, _TOLD_LATER):
-                later.append(effect)
-            elif isinstance(effect, Persist):
-                self._persist(effect)
-            elif isinstance(effect, Compare):
-                if self._compare is not None:
-                    self._compare(effect)
-            elif self._call is not None:
-                self._call(effect.shard, cast("Request", effect.request))
-        for effect in later:
-            if isinstance(effect, Publish):
-                for watcher in self._watchers:
-                    watcher(cast("Notice", effect.notice))
-            else:
-                level = logging.CRITICAL if effect.grave else logging.INFO
-                _log.log(level, "%s: %s", effect.event, effect.text, extra={"event": effect.event})
+    def _tell(self, effect: Publish | Story) -> None:
+        """Tell watchers of a commit, or the log of an event."""
+        if isinstance(effect, Publish):
+            for watcher in self._watchers:
+                watcher(cast("Notice", effect.notice))
+        else:
+            level = logging.CRITICAL if effect.grave else logging.INFO
+            _log.log(level, "%s: %s", effect.event, effect.text, extra={"event": effect.event})
 
     def _persist(self, effect: Persist) -> None:
         if self._store_thread is not None:

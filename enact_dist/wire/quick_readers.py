@@ -142,7 +142,7 @@ class _Code:
             name = f"{one}_read"
             if each in SCALARS:
                 self._names[name] = reader_of_each(each)
-                value = f"{name}({one}, bodies)"
+                value = f"({name}({one}, bodies) if {one} else ())"
             else:
                 self._names[name] = self._reader_of(each)
                 one_alone = f"({name}({one}[0], bodies),) if len({one}) == 1"

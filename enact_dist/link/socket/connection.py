@@ -30,7 +30,7 @@ from enact_dist.link.socket.frames import (
 from enact_dist.link.socket.peers import Peer
 from enact_dist.link.socket.watcher import Publisher, SocketWatcher
 from enact_dist.patterns import checked_patterns
-from enact_dist.wire.frames import decode_frame, decode_request
+from enact_dist.wire.frames import decode_frame, decode_request, encode_parts
 
 OPEN_S: Final = 1.0
 """How long a new connection may take to name its session."""
@@ -161,7 +161,11 @@ class SocketConnection:
                 continue
             host.submit(message, self._take, self.identity)
             self.step = step = step + 1
-            self._send_answer()
+            answer, self._answer = self._answer, None
+            if answer is not None:
+                self._send(answer)
+            else:
+                self._send_late()
 
     def _may_name(self, session: str, message: Request) -> bool:
         """Whether a message may name another session, as a question for a commit's outcome does.
@@ -188,20 +192,22 @@ class SocketConnection:
             self._late = answer
         self._wake()
 
-    def _send_answer(self) -> None:
-        """Send the answer, or wait for the thread that produces it and send the rest."""
-        answer, self._answer = self._answer, None
-        if answer is None:
-            self._answered.acquire()
-            answer, self._late = self._late, None
-            rest, self._rest = self._rest, None
-            if rest is not None:
-                self.connected.sendall(rest)
+    def _send_late(self) -> None:
+        """Wait for the thread that produces the answer, and send what it has not sent."""
+        self._answered.acquire()
+        answer, self._late = self._late, None
+        rest, self._rest = self._rest, None
+        if rest is not None:
+            self.connected.sendall(rest)
         if answer is not None:
-            send_frame(self.connected, *encoded(answer, self._service.host.count))
+            self._send(answer)
 
     def _send(self, answer: Answer) -> None:
-        send_frame(self.connected, *encoded(answer, self._service.host.count))
+        try:
+            header, bodies = encode_parts(answer)
+        except ProtocolError:
+            header, bodies = encoded(answer, self._service.host.count)
+        send_frame(self.connected, header, bodies)
 
     def _send_what_fits(self, answer: Answer) -> memoryview | None:
         """Send without blocking; return the rest, which the connection's thread sends."""

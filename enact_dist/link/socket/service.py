@@ -28,6 +28,8 @@ from enact_dist.link.socket.peers import Deaths, Peer, check_peer
 from enact_dist.wire.frames import encode_frame
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from enact_dist.core.protocol.messages import Notice
     from enact_dist.link.host import ShardHost
     from enact_dist.link.memory.shared_folder import SharedFolder
@@ -79,7 +81,7 @@ class SocketService:
         self._watchers: tuple[SocketWatcher, ...] = ()
         self._listener = _listen(folder)
         self._deaths = Deaths(self._died)
-        self._unwatch = host.watch(self._publish)
+        self._unwatch: Callable[[], None] | None = None
         host.add_inbox(self.drain_inbox)
         host.add_inbox(self._tell_skipped)
         self._thread = threading.Thread(target=self._accept, name="enact-accept", daemon=True)
@@ -209,6 +211,8 @@ class SocketService:
         """Send all further notices to `watcher`."""
         with self._mutex:
             self._watchers = (*self._watchers, watcher)
+            if self._unwatch is None:  # until a process watches, a commit costs nothing here
+                self._unwatch = self.host.watch(self._publish)
 
     def unwatch(self, watcher: SocketWatcher) -> None:
         """Stop sending notices to `watcher`."""
@@ -235,7 +239,8 @@ class SocketService:
         if self._closing.is_set():
             return
         self._closing.set()
-        self._unwatch()
+        if self._unwatch is not None:
+            self._unwatch()
         end_socket(self._listener)
         self._thread.join(JOIN_S)
         self._listener.close()
