@@ -1,4 +1,4 @@
-"""How far two data are apart: what an aspect's data are compared by, and how far apart they may be.
+"""How far two data are apart, and how far apart they may be.
 
 A *comparator* is anything that takes two data of an aspect and returns a `Difference`; an aspect
 names its own with ``Aspect(…, compare=…)``.  `Tolerance` compares plain values, arrays, frozen
@@ -39,9 +39,9 @@ T_contra = TypeVar("T_contra", contravariant=True)
 BLOCK_ELEMENTS: Final = 1 << 17
 """Elements of an array that are compared in one step: a few MB of memory, whatever its size."""
 FIGURES_MIN: Final = 4
-"""So many digits of a distance are shown where they are enough."""
+"""Digits of a distance that are shown if they are enough."""
 FIGURES_MAX: Final = 17
-"""No two numbers are the same in so many."""
+"""Digits that tell any two numbers apart."""
 SHOWN_MAX: Final = 40
 """Characters of a value that a difference quotes."""
 _EXACT_KINDS: Final = "bSUVmMO"
@@ -59,7 +59,7 @@ class Difference:
         crossed: Whether the distance exceeds the tolerance.
         unit: "mm", "m", …; empty if the data name it themselves, or have none.
         where: The worst part: ``.vertices_m[17, 2]``, ``['place/3'].verdict``; empty for the whole.
-        what: The values on either side, for people.
+        what: The values on either side, as a text.
     """
 
     distance: float
@@ -71,7 +71,7 @@ class Difference:
 
     @property
     def excess(self) -> float:
-        """The distance in tolerances: above 1 where it is crossed."""
+        """The distance as a multiple of the tolerance: above 1 if it is crossed."""
         if self.tolerance:
             return self.distance / self.tolerance
         return math.inf if self.distance else 0.0
@@ -90,7 +90,7 @@ class Difference:
         return f"{distance}{unit} apart{allowed}{place}{what}"
 
     def _figures(self) -> tuple[str, str]:
-        """Return distance and tolerance, with so many digits that an excess is to be seen."""
+        """Return distance and tolerance with enough digits to show an excess."""
         for digits in range(FIGURES_MIN, FIGURES_MAX + 1):
             distance, tolerance = f"{self.distance:.{digits}g}", f"{self.tolerance:.{digits}g}"
             if distance != tolerance or not self.crossed:
@@ -102,7 +102,7 @@ EQUAL: Final = Difference(0.0)
 
 
 class Comparator(Protocol[T_contra]):
-    """Says how far two data of an aspect are apart; called once for each pair, and pure."""
+    """Computes how far two data of an aspect are apart; pure, called once for each pair."""
 
     def __call__(self, left: T_contra, right: T_contra, /) -> Difference:
         """Return the difference; neither datum is null."""
@@ -120,9 +120,9 @@ class Tolerance:
     Args:
         absolute: How far numbers may be apart, in the unit of the data.
         relative: How far, as a part of the larger magnitude, from 0 to below 1.
-        unit: Name of that unit, only to be shown.
-        fields: How fields of these names are compared, of dataclasses and structured arrays at any
-            depth; with None they are not.
+        unit: Name of that unit, for display only.
+        fields: Comparators for fields of these names, in dataclasses and structured arrays at any
+            depth; None excludes a field.
 
     Raises:
         ValueError: A tolerance is negative or not finite, or `relative` is 1 or more.
@@ -283,19 +283,19 @@ class Tolerance:
 
 
 EXACT: Final = Tolerance()
-"""Allows no difference; what an aspect is compared by that names nothing else."""
+"""Allows no difference; the comparator of an aspect that names none."""
 
 
 def worst(parts: Iterable[Difference]) -> Difference:
     """Return the difference that exceeds its tolerance most, the first of several; `EQUAL` of none.
 
-    Two with no tolerance are set apart by their distance.
+    Of two without a tolerance it is the one with the larger distance.
     """
     return max(parts, key=lambda part: (part.crossed, part.excess, part.distance), default=EQUAL)
 
 
 def _kind(value: object) -> str:
-    """Return the type of a value as people know it."""
+    """Return the name of a value's type as users know it."""
     if isinstance(value, dict) and "__type__" in value:
         return str(value["__type__"])
     if isinstance(value, np.generic):
@@ -327,7 +327,7 @@ _Array = np.ndarray[Any, Any]
 
 
 def _blocks(left: _Array, right: _Array) -> Iterator[tuple[int, _Array, _Array]]:
-    """Yield flat parts of two arrays of one shape that are not the same, with where they begin."""
+    """Yield those flat parts of two arrays of one shape that differ, each with its start index."""
     one, other = _flat(left), _flat(right)
     for start in range(0, left.size, BLOCK_ELEMENTS):
         parts = one[start : start + BLOCK_ELEMENTS], other[start : start + BLOCK_ELEMENTS]

@@ -31,7 +31,7 @@ from __future__ import annotations
 from typing import Final
 
 SHARD_RESTARTED: Final = "its shard restarted"
-"""How the cause begins of a lock that was lost with its shard's epoch."""
+"""How the cause of a lock begins that was lost because its shard restarted."""
 
 
 class EnactError(Exception):
@@ -79,7 +79,7 @@ class ConfigError(MisuseError):
 
     Attributes:
         path: The file, or the empty string.
-        line: Line number in it from 1, or 0 where none applies.
+        line: Line number in it from 1, or 0 if none applies.
     """
 
     def __init__(self, message: str, *, path: str = "", line: int = 0) -> None:
@@ -112,8 +112,7 @@ class ForgottenError(EnactError):
 
     Attributes:
         oldest_ns: Timestamp from which on the requested data are known, nanoseconds since 1970; 0
-            if
-            unknown.
+            if unknown.
     """
 
     def __init__(self, message: str, *, oldest_ns: int = 0) -> None:
@@ -129,7 +128,7 @@ class LockTimeoutError(EnactError):
     """The lock was not granted in time; nothing is held.
 
     Attributes:
-        holders: Who held the data at the last look, one line each.
+        holders: Who held the data when last asked, one line each.
         waited_s: How long the lock waited, in seconds.
     """
 
@@ -142,7 +141,7 @@ class LockTimeoutError(EnactError):
 
 
 class NoRoomError(EnactError):
-    """A shard has no room for a large datum: its cap is reached, and no history is left to go."""
+    """A shard has no room for a large datum: its cap is reached, and no history is left to free."""
 
 
 class LeaseLostError(EnactError):
@@ -158,7 +157,7 @@ class LeaseLostError(EnactError):
 
     @property
     def restarted(self) -> bool:
-        """Whether its shard restarted: taken again, the lock is granted as before."""
+        """Whether its shard restarted; the lock can then be taken again as before."""
         return self.cause.startswith(SHARD_RESTARTED)
 
 

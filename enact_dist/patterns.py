@@ -67,7 +67,7 @@ def checked_pattern(pattern: object) -> str:
 def checked_patterns(patterns: Iterable[str]) -> None:
     """Raise if a pattern is invalid, or if there are too many to match at once.
 
-    A name without a star matches itself alone and does not count.
+    A name without a star matches only itself and does not count.
 
     Raises:
         ValueError: As `checked_pattern`, or more than `PATTERNS_MAX` of them have a star.
@@ -87,7 +87,7 @@ class Patterns:
     """Several patterns together: the names that any of them covers.  No patterns cover all names.
 
     Attributes:
-        starred: Those that have to be tried one by one; the others are names, which are looked up.
+        starred: Those with stars, which are tried one by one; the others are names in a set.
     """
 
     __slots__ = ("_names", "starred")
@@ -149,8 +149,8 @@ def _segments_overlap(one: str, other: str) -> bool:
 def _source(pattern: str) -> str:
     """Return the expression for names that end with a slash, as each of their segments then does.
 
-    Runs of segments stand between the ``**``: the first one at the begin of the name, the last one
-    at its end, each other one at the next place where it fits.
+    Runs of segments are separated by ``**``: the first one matches at the start of the name, the
+    last one at its end, each other one at the next place where it fits.
     """
     groups = [
         (deep, "".join(map(_segment_source, segments)))

@@ -1,4 +1,4 @@
-"""How much of each datum's history stays: `Retention`, what an aspect or a `cell.toml` says."""
+"""How much of each datum's history stays: `Retention`, as set by an aspect or a `cell.toml`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Final
 
 VERSIONS_MAX: Final = 100_000
-"""Most versions of one slot that a retention may ask for: what a shard keeps of all its slots."""
+"""Most versions of one slot that a retention may ask for; a shard keeps no more of all slots."""
 AGE_S_MAX: Final = 1e9
 """Longest age that a retention may ask for: some thirty years."""
 SIZE_BYTES_MAX: Final = 1 << 50
@@ -15,13 +15,13 @@ SIZE_BYTES_MAX: Final = 1 << 50
 
 @dataclass(frozen=True, slots=True)
 class Retention:
-    """How much of each datum's history stays; what is unsaid (None) has no limit of its own.
+    """How much of each datum's history stays; a limit of None does not apply.
 
-    A replaced version stays as long as all three allow, and its shard's room for all of them does
-    (256 MiB beside the payloads, 100,000 versions).  The newest version always stays.
+    A replaced version stays as long as all three limits allow, and as its shard has room (256 MiB
+    beside the payloads and 100,000 versions for all slots).  The newest version always stays.
 
     Args:
-        versions: How many versions stay, the newest included; 1 is no history.
+        versions: How many versions stay, the newest included; 1 keeps no history.
         age_s: How long a version stays after it was replaced, in seconds.
         size_bytes: How many bytes of replaced data stay, per datum.
 
@@ -58,11 +58,11 @@ def _check_count(name: str, found: object, highest: int) -> None:
 
 
 DEFAULT_RETENTION: Final = Retention(versions=16, age_s=600.0, size_bytes=16 << 20)
-"""What holds where neither the aspect nor `cell.toml` says anything."""
+"""Applies if neither the aspect nor `cell.toml` sets a retention."""
 
 
 def checked_retention(retention: object) -> Retention | None:
-    """Return a retention as its parts; a bare number is one of versions.
+    """Return a retention; a bare number is a number of versions.
 
     Raises:
         ValueError: It is neither a number of versions, nor a `Retention`, nor None.

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 T_co = TypeVar("T_co", covariant=True)
-"""Type of the datum that a request names; what only reads may promise less than it holds."""
+"""Type of the datum that a request names; covariant, since reading allows a supertype."""
 
 NAME_LENGTH_MAX: Final = 200
 """Longest name of an entity, aspect or world context; keeps every key of the wire below 1 kB."""
@@ -154,9 +154,9 @@ class Aspect(Generic[T]):
         durability: What a commit of this aspect survives; ``None`` leaves it to `cell.toml`
             (there: `durable` unless written otherwise).  `cell.toml` wins over this argument.
         retention: How much of each datum's history stays, as a number of versions (the newest
-            included; 1 is none) or a `Retention`; ``None`` leaves it to `cell.toml` (there:
-            `DEFAULT_RETENTION` unless written otherwise).  Of several that ask, `cell.toml` too,
-            the largest figures count.
+            included; 1 keeps no history) or a `Retention`; ``None`` leaves it to `cell.toml`
+            (there: `DEFAULT_RETENTION` unless written otherwise).  If several programs and
+            `cell.toml` ask, the largest figures count.
         compare: How `WorldContext.diff` compares its data; it does not affect whether two aspects
             are the same.
 
@@ -187,15 +187,17 @@ class Aspect(Generic[T]):
 
 
 CODED: Final[set[type[Any]]] = set()
-"""The types with a registered codec, whose values may be what their codec makes plain data of."""
+"""The types with a registered codec; they need not be frozen."""
 _frozen: set[type[Any]] = set()
-"""The dataclasses that were looked at and are frozen, with all that they contain."""
+"""The dataclasses that were checked: they are frozen, with all that they contain."""
 
 
 def refuse_unfrozen(hint: Any, where: str = "") -> None:
-    """Raise `DatumTypeError` for a dataclass in a type that is not frozen; `where` is its place.
+    """Raise `DatumTypeError` if a type contains a dataclass that is not frozen.
 
-    What a dataclass contains whose annotations cannot be resolved yet is not looked at.
+    `where` is the place of the type in an outer one, for the message.
+
+    A dataclass whose annotations cannot be resolved yet is not checked further.
     """
     if not isinstance(hint, type) or typing.get_origin(hint) is not None:
         for part in typing.get_args(hint):
@@ -265,7 +267,7 @@ class Access(enum.IntEnum):
     WRITE_EACH = 5
     VIEW_EACH = 6
 
-    # Plain attributes and no properties: every request of every lock is looked at for them.
+    # Plain attributes instead of properties: every request of every lock reads them.
     each: bool
     """Whether the request names a pattern of entities."""
     locks: bool
@@ -280,7 +282,7 @@ class Access(enum.IntEnum):
 
 
 ACCESSES: Final = {access.value: access for access in Access}
-"""The accesses by their number: a third of the time of `Access(number)`."""
+"""The accesses by number: a look-up takes a third of the time of `Access(number)`."""
 
 
 class Context:
@@ -288,7 +290,7 @@ class Context:
 
     __slots__ = ("name",)
     past: ClassVar[bool] = False
-    """Whether it shows what was, which can only be viewed."""
+    """Whether it shows the past, which can only be viewed."""
 
     def __init__(self, name: str) -> None:
         self.name = checked_name("world context", name, slashes=False)

@@ -114,7 +114,7 @@ def worlds(*names: str, clock: ManualClock | None = None) -> Iterator[Cell]:
 
 
 def run_once(actor: Actor, cell: Cell, worlds: Mapping[str, str] | None = None) -> int:
-    """Let an actor do what is pending for it now, in this thread, and return.
+    """Let an actor do what is pending now, in this thread, and return.
 
     An actor with triggers is updated once per entity whose trigger datum is new to this actor
     object: all existing ones at the first call, those that changed since at the next.  A source,
@@ -213,7 +213,7 @@ def _update_sets(actor: Actor, bound: BoundActor) -> int:
 
 
 def _pending(actor: Actor, bound: BoundActor) -> PendingTriggers:
-    """Return what is pending for this actor object, brought up to the newest states."""
+    """Return what is pending for this actor object, including the newest states."""
     # Kept with the actor object: that is what "new to this actor" means, and it ends with it.
     pending = vars(actor).setdefault(
         "_pending_in_test", PendingTriggers(per_entity=bound.declaration.per_entity)

@@ -26,7 +26,7 @@ class Block(NamedTuple):
         writing: The lock's writes, which they add to.
         use: Raises unless the block is running and the lock not known to be lost.
         put: Sets a slot to a value of an aspect with a capture stamp.
-        stamp: Returns the capture stamp that holds where the program names none.
+        stamp: Returns the capture stamp of a datum if the program names none.
         shard_of: Returns the shard that owns a slot.
     """
 

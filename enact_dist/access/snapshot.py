@@ -185,7 +185,7 @@ def slot_states(
 def _spread(
     asked: tuple[LockRequest[Any] | Together[Any], ...],
 ) -> tuple[Together[Any] | None, tuple[LockRequest[Any], ...]]:
-    """Return the set that is asked for, and all requests, those of the set in its place."""
+    """Return the requested set, and all requests, with those of the set at its place."""
     sets = [request for request in asked if isinstance(request, Together)]
     if len(sets) > 1:
         raise MisuseError(f"one view shows one set; take {sets[1]!r} in a view of its own")
@@ -205,7 +205,7 @@ def _newest_set(session: Session, together: Together[Any]) -> tuple[int, ...]:
             for request, each in zip(together.requests, versions, strict=True)
         )
         raise NullDatumError(
-            f"no capture stamp is common to all {len(versions)} data (newest stamps, 0 is unsaid:"
+            f"no capture stamp is common to all {len(versions)} data (newest stamps, 0 is unknown:"
             f" {found}); write with lock.put(…, stamp_ns=…), and let the aspects retain as many"
             " versions as are under way at once",
             reason=NullReason.OUTSIDE_RETENTION.value,
@@ -216,7 +216,7 @@ def _newest_set(session: Session, together: Together[Any]) -> tuple[int, ...]:
 def take_readings(
     session: Session, items: list[Item], *, past_ns: int = 0, data: bool = True
 ) -> Readings:
-    """Take one view, as of a stamp if one is given, and fetch what is large of its `data`."""
+    """Take one view, as of a timestamp if one is given, and fetch its large `data`."""
     client = session.client
     lock = client.acquire(items, wait_s=client.request_timeout_s, hold_s=VIEW_S, past_ns=past_ns)
     try:
@@ -237,7 +237,7 @@ class HeldView(Closing):
 
     Args:
         session: The session that takes the view.
-        items: What is viewed.
+        items: The slots and patterns to view.
         past_ns: The timestamp to view; 0 is the present.
 
     Attributes:
@@ -279,7 +279,7 @@ class Snapshot:
     """Data as of one view, indexed by the requests it was made with.
 
     Attributes:
-        captured_ns: The capture stamp of its `Together`, 0 where none was asked for.
+        captured_ns: The capture stamp of its `Together`; 0 if none was requested.
     """
 
     def __init__(
@@ -295,7 +295,7 @@ class Snapshot:
         self.captured_ns = captured_ns
 
     def has_set(self) -> bool:
-        """Whether so many data of the `Together` are not null as it asks for."""
+        """Whether the `Together` has as many data as it requires."""
         if self._together is None:
             return True
         states = [self._readings.state(slot_of(view)) for view in self._together.requests]
@@ -328,14 +328,14 @@ class Snapshot:
     @overload
     def get(self, request: LockRequestOne[T], default: T) -> T: ...
     def get(self, request: LockRequestOne[T], default: T | None = None) -> T | None:
-        """Return the datum, or `default` where the world context does not know it."""
+        """Return the datum, or `default` if the world context does not know it."""
         try:
             return self[request]
         except NullDatumError:
             return default
 
     def state(self, request: LockRequestOne[Any]) -> SlotState | None:
-        """Return what was shown of a slot; as `version`, for the framework."""
+        """Return the state that was shown of a slot; as `version`, for the framework."""
         check_requested(request, self._requests, "view")
         return self._readings.state(slot_of(request))
 

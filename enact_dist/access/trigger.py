@@ -96,7 +96,7 @@ class Newer:
 
 @dataclass(frozen=True, slots=True)
 class LockStatistics:
-    """What a lock went through.
+    """Times and counts of one lock.
 
     Attributes:
         granted: Whether it was granted.

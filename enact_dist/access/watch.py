@@ -5,8 +5,8 @@ skipped, a number that a keep-alive knows and no notice brought, or a new epoch 
 were missed: the watch then lists the slots again and yields one change per slot that moved, whose
 `gap` says how many versions were skipped.
 
-A shard that is added to the cell is listed as soon as this client knows of it.  What was known of
-entities that have moved there stays known: a state that moved unchanged is no change.
+A shard that is added to the cell is listed as soon as this client knows of it.  Entities may have
+moved to it: a state that moved unchanged is no change.
 
 Versions that a restarted shard did not store start again, so its new epoch makes each state a
 new one: its number does not continue the old count, and how many versions were lost is unknown.
@@ -36,9 +36,9 @@ if TYPE_CHECKING:
     from enact_dist.link.client.locks import CellClient
 
 POLL_S: Final = 0.1
-"""How often a watch looks whether notices that it lacks have come."""
+"""How often a watch that lacks notices checks whether they have come."""
 QUIET_S: Final = 0.5
-"""How often a quiet watch looks whether it lacks any: as often as the keep-alives tell."""
+"""How often a quiet watch checks whether it lacks any: as often as keep-alives come."""
 RESYNC_S: Final = 1.0
 """How long one attempt to list the slots of a shard again may take."""
 VANISHED: Final = (0, 0)
@@ -68,11 +68,11 @@ class Closing(ABC):
 
 
 class Following(Closing, Generic[T]):
-    """Also an iterator, of what `next` returns until it is closed."""
+    """Also an iterator: of what `next` returns, until it is closed."""
 
     @abstractmethod
     def next(self, timeout_s: float | None = None) -> T | None:
-        """Return what comes next, or None when nothing does in time or it is closed."""
+        """Return the next item, or None if none comes in time or it is closed."""
 
     def __iter__(self) -> Self:
         return self
@@ -123,7 +123,7 @@ class Change:
 
 @dataclass(slots=True)
 class _Following:
-    """What is known of one shard's notices: all up to `number` of `epoch` are accounted for.
+    """The notices of one shard: all up to `number` of `epoch` are accounted for.
 
     `behind` is a later number from a keep-alive, and the time of that keep-alive.
     """
@@ -349,7 +349,7 @@ class Watch(Following[Change]):
         )
 
     def _goes_on(self, shard: str, slot: Slot, epoch: int) -> bool:
-        """Whether a restarted shard goes on counting the versions of a slot."""
+        """Whether a restarted shard continues the version numbers of a slot."""
         if slot.aspect not in self._client.aspect_entries():
             # Another program registered it after this client had greeted the shard.
             self._client.call_once([(shard, self._client.core.hello(shard))])

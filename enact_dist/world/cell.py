@@ -205,7 +205,7 @@ class Cell(Closing):
         self.unpin(label)
 
     def wait(self, position: Position, *, timeout_s: float = 10.0) -> bool:
-        """Wait until everything committed up to `position` is visible; say whether it is.
+        """Wait until all commits up to `position` are visible; say whether they are.
 
         Raises:
             LockHeldError: This thread holds a lock.

@@ -1,4 +1,4 @@
-"""How a process comes to a cell: `connect` over the network, `local` inside this process."""
+"""Opening a cell: `connect` over the network, `local` inside this process."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from enact_dist.link.clock import Clock
 
 TTL_S: Final = 2.0
-"""Lease of a session that no `cell.toml` says otherwise about."""
+"""Lease of a session if no `cell.toml` sets one."""
 LOCAL_SHARD: Final = "local"
 
 
@@ -40,15 +40,15 @@ def connect(
     """Join a running cell.
 
     Args:
-        target: A `cell.toml`, or one endpoint such as ``tcp/host:7447``; one is enough, as each
+        target: A `cell.toml`, or one endpoint such as ``tcp/host:7447``; one is enough, since each
             shard knows the others.
         actor: Name under which `enact lock ls` and `enact actor ls` show this process.
         timeout_s: How long to wait for a first shard to answer.
         request_timeout_s: How long a request waits for a shard that does not answer before the
             shard counts as unreachable.  Locks have a time limit of their own, and a commit takes
             as long as it takes to learn its outcome.
-        observer: Only look: no lock can be taken, no world context or aspect comes to be, and a
-            shard keeps no record of the session.
+        observer: Read only: no lock can be taken, no world context or aspect is created, and
+            shards keep no record of the session.
 
     Raises:
         ShardUnreachableError: No shard answered in time; the message names shards and endpoints.
@@ -101,19 +101,19 @@ def local(
     actor: str = "",
     clock: Clock | None = None,
 ) -> Cell:
-    """Run one shard inside this process: the paper's mode, several actors as threads.
+    """Run one shard inside this process: the paper's mode, with actors as threads.
 
     Args:
-        path: Folder that keeps what is committed; None keeps it in memory, and every aspect is
-            volatile then whatever it asks for.
-        worlds: World contexts to make.
+        path: Folder that stores the commits; with None they stay in memory, and every aspect is
+            volatile, whatever its durability.
+        worlds: World contexts to create.
         config: Aspects, further world contexts and the session's TTL of a `cell.toml`.
         actor: Name under which this process is shown.
-        clock: Times of the shard, for tests; the default is this host's.
+        clock: Clock of the shard, for tests; the default is this host's.
 
     Raises:
         StoreError: The folder is in use, unreadable or corrupt.
-        MisuseError: `worlds` holds no names of world contexts.
+        MisuseError: `worlds` contains something that is no name of a world context.
     """
     from enact_dist.core.shard.state import ShardSettings
     from enact_dist.link.client.locks import CellClient
@@ -151,10 +151,10 @@ def _world_names(worlds: Sequence[str]) -> tuple[str, ...]:
 
 
 def _is_endpoint(target: str | Path) -> bool:
-    """Say whether `target` is written as an endpoint, with a port that there can be.
+    """Say whether `target` is written as an endpoint; check its host and port.
 
     Raises:
-        ConfigError: It is an endpoint with an invalid port.
+        ConfigError: It is an endpoint with an invalid host or port.
     """
     if isinstance(target, Path):
         return False
@@ -181,10 +181,10 @@ _ENDPOINT: Final = "an endpoint looks like 'tcp/host:7447'"
 
 
 def _checked_actor(actor: str) -> str:
-    """Return a name that is safe in logs and tables of others.
+    """Return a name that is safe in logs and tables.
 
     Raises:
-        ConfigError: It has a character that could not, or is too long.
+        ConfigError: It has a control character, or is too long.
     """
     if is_safe(actor) and len(actor) <= NAME_CHARACTERS_MAX:
         return actor

@@ -1,4 +1,4 @@
-"""What a shard answers; see `core.protocol.messages` for the rules."""
+"""The answers and notices of a shard; see `core.protocol.messages` for the rules."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from enact_dist.core.protocol.parts import (
 
 @message
 class Welcome:
-    """Who this shard is and what the cell looks like from here."""
+    """Which shard this is, and what it knows of the cell."""
 
     shard: str
     epoch: int
@@ -55,8 +55,8 @@ class Granted:
     """The lock is held.  `states`: every named slot, and every matching one of a pattern.
 
     `count_seen` is the highest message counter that had arrived from the session; `hold_left_ns`
-    counts from when this was sent.  `stamp_ns` is the shard's hybrid logical time, `from_ns` the
-    largest stamp of what is shown: views elsewhere must not lie before it.
+    counts from the sending of this answer.  `stamp_ns` is the shard's hybrid logical time,
+    `from_ns` the largest timestamp in `states`: views at other shards must not be older.
     """
 
     lock: LockId
@@ -71,7 +71,7 @@ class Granted:
 
 @message
 class Waiting:
-    """Not yet granted; ask again.  `place` counts from 1, `blockers` are those in the way."""
+    """Not yet granted; ask again.  `place` counts from 1, `blockers` are the locks ahead."""
 
     lock: LockId
     epoch: int
@@ -91,7 +91,7 @@ class Stale:
 class Viewed:
     """Committed data that were current from `from_ns` to `until_ns`, at every stamp between.
 
-    Where the first lies after the second, an undecided commit stands in the way: ask again at
+    If the first is later than the second, an undecided commit blocks the view: ask again at
     `from_ns`.
     """
 
@@ -147,7 +147,7 @@ class Committed:
 
 @message
 class Staged:
-    """So much of a payload has come in slices, from its begin on, without a hole.
+    """How much of a payload has arrived in slices, from its start and without a gap.
 
     `shared` says that it is a file in the shard's folder, to be filled there, too.  Until its
     commit it is called `draft` there ("": `file`), a name that only this client learns.
@@ -171,7 +171,7 @@ class Fenced:
 class Changed:
     """An expected slot has moved on to this version; nothing was written, the lock is released.
 
-    The expected version itself means: another lock holds the slot for writing now.
+    If `version` is the expected one, another lock holds the slot for writing now.
     """
 
     lock: LockId
@@ -183,8 +183,8 @@ class Changed:
 class Prepared:
     """The writes are kept until the primary decides; their stamp is at least this one.
 
-    They outlast a power cut even where their data are `os` or volatile: so do the reads beside
-    them, on which the decision relies.
+    They survive a power cut even if their data are `os` or volatile; so do the reads beside them,
+    on which the decision relies.
     """
 
     lock: LockId
@@ -194,7 +194,7 @@ class Prepared:
 
 @message
 class Finished:
-    """Nothing of the lock waits for a decision here any more, and that survives."""
+    """Nothing of the lock waits for a decision here any more, not even after a restart."""
 
     lock: LockId
 
@@ -295,7 +295,7 @@ class Locks:
 
 @message
 class Sessions:
-    """Sessions, catalogue and counters of a shard; the catalogue stands on the first page alone."""
+    """Sessions, catalogue and counters of a shard; the catalogue is on the first page only."""
 
     shard: str
     epoch: int
@@ -313,7 +313,7 @@ class Sessions:
 
 @message
 class Broken:
-    """Whether a lock of that number was live, and what it was."""
+    """Whether there was a lock of that number, and its description."""
 
     found: bool
     holder: Holder | None
@@ -330,14 +330,14 @@ class Audited:
 
 @message
 class EpochChanged:
-    """The shard is in this epoch and does not know the session there: drop, say Hello, go on."""
+    """The shard is in this epoch and does not know the session: drop its grants, send `Hello`."""
 
     epoch: int
 
 
 @message
 class WrongShard:
-    """The request was placed by another map than the shard's."""
+    """The client placed the request by another map than the shard's."""
 
     placement: PlacementMap
 
@@ -362,9 +362,9 @@ class Versions:
 
 @message
 class Forgotten:
-    """The state of a slot as of the asked stamp has left its retention.
+    """The state of a slot as of the requested timestamp has left its retention.
 
-    All that was asked here is known from `oldest_ns` on.
+    Everything that was requested of this shard is known from `oldest_ns` on.
     """
 
     slot: Slot
@@ -373,7 +373,7 @@ class Forgotten:
 
 @message
 class Forked:
-    """The fork is there, with so many slots."""
+    """The fork exists; `slots` is how many slots it has."""
 
     world: str
     slots: int
@@ -382,7 +382,7 @@ class Forked:
 
 @message
 class Dropped:
-    """The world context is not there (any more); so many slots of it went now."""
+    """The world context does not exist (any more); `slots` is how many slots were deleted now."""
 
     world: str
     slots: int
@@ -390,9 +390,9 @@ class Dropped:
 
 @message
 class Kept:
-    """What a label keeps now, and which of the asked versions were forgotten before.
+    """Which versions a label pins now, and which of the requested ones were already forgotten.
 
-    Of what it keeps one page, by slot and version.
+    The pinned versions come page by page, ordered by slot and version.
     """
 
     versions: tuple[SlotVersion, ...]

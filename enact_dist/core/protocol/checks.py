@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.messages import AspectEntry, Finish, Item, Prepare, WriteItem
 
 WORLDS_TOLD_MAX: Final = 100
-"""World contexts that a refusal names: a text has at most 64 KiB."""
+"""Most world contexts that a refusal names: a text has at most 64 KiB."""
 NO_PAYLOAD: Final = "no_payload"
 """The code of a refusal that leaves the lock unchanged: named bytes are missing, send them."""
 
@@ -32,19 +32,23 @@ _DURABILITIES: Final = ("", *(durability.value for durability in Durability))
 
 
 def wrong_access(items: Collection[Item]) -> Refused | None:
-    """Refuse an access or a pattern that there is not, and a write of what was captured when."""
+    """Refuse an unknown access, an invalid pattern, and a capture stamp on anything but a view."""
     for item in items:
         if item.captured_ns and item.access not in _ACCESSES_BY_STAMP:
-            return _refused(f"{item.entity}/{item.aspect} was asked by stamp; only a View can be")
+            return _refused(
+                f"{item.entity}/{item.aspect} was requested by capture stamp; only a View can be"
+            )
         if item.nearest and not item.captured_ns:
-            return _refused(f"{item.entity}/{item.aspect} was asked nearest to no stamp")
+            return _refused(
+                f"{item.entity}/{item.aspect} was requested nearest to no capture stamp"
+            )
         if item.access not in _ACCESSES:
-            return _refused(f"access {item.access} was asked; there are {sorted(_ACCESSES)}")
+            return _refused(f"access {item.access} was requested; known: {sorted(_ACCESSES)}")
     return wrong_patterns(item.entity for item in items if item.access in _ACCESSES_EACH)
 
 
 def wrong_patterns(patterns: Iterable[str]) -> Refused | None:
-    """Refuse patterns that no client makes; to match them must stay cheap."""
+    """Refuse patterns that no client makes: matching must stay cheap."""
     try:
         checked_patterns(patterns)
     except ValueError as error:
@@ -71,14 +75,14 @@ def wrong_aspect(entry: AspectEntry) -> Refused | None:
     """Refuse an aspect with an unusable name, durability or retention."""
     if entry.durability not in _DURABILITIES:
         return _refused(
-            f"durability {entry.durability!r} of aspect {entry.name!r} was asked; there are"
+            f"durability {entry.durability!r} of aspect {entry.name!r} was requested; known:"
             f" {', '.join(filter(None, _DURABILITIES))}"
         )
     for figure in (entry.retention, entry.age_ns, entry.size):
         if not 0 <= figure <= NO_LIMIT:
             return _refused(
-                f"a retention of {figure} of aspect {entry.name!r} was asked; none of its figures"
-                f" lies outside 0 to {NO_LIMIT}"
+                f"a retention of {figure} of aspect {entry.name!r} was requested; each"
+                f" of its figures lies in 0 to {NO_LIMIT}"
             )
     return wrong_name("aspect", entry.name, slashes=False)
 
@@ -116,7 +120,7 @@ def wrong_writes(writes: Collection[WriteItem]) -> Refused | None:
 
 
 def wrong_reads(message: Commit | Prepare) -> Refused | None:
-    """Refuse to keep a longer lineage than any honest client tells."""
+    """Refuse a longer lineage than any honest client sends."""
     if len(message.reads) <= READS_MAX and message.reads_left_out >= 0:
         return None
     return _refused(
@@ -156,7 +160,7 @@ def wrong_parties(message: Commit | Prepare, *, peers: Collection[str]) -> Refus
 
 
 def wrong_finish(message: Finish, primary: str) -> Refused | None:
-    """Refuse the word of a shard that is not the primary."""
+    """Refuse a decision that does not come from the primary."""
     if message.position.shard == primary:
         return None
     return _refused(

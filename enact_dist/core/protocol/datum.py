@@ -81,14 +81,14 @@ class Datum:
     Attributes:
         encoding: How `wire` reads the body (msgpack, a few bytes up to some kB).
         body: `size` bytes that are never changed any more; a memoryview may cover a mapped file.
-            Empty where only `file` says where they are.
+            Empty if only `file` names them.
         size: Length of the body in bytes.
         stamp_ns: When the datum was captured, nanoseconds since 1970 by the actor's clock; 0
             if the actor did not set it.
         file: Name of the payload at the slot's shard that holds these bytes, so that they need
             not travel with a message ("": none).
-        fault: Returns what is wrong with the bytes, "" if nothing; to be called before they are
-            handed out.  None: they are known to be sound.
+        fault: Returns what is wrong with the bytes ("": nothing); call it before handing them out.
+            None: they are known to be intact.
     """
 
     encoding: bytes

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.parts import AspectEntry
 
 TYPES_MAX: Final = 16
-"""So many types an aspect may have had, one after the other."""
+"""Most types that an aspect may have had, one after the other."""
 DEFAULT_MARK: Final = "="
 """Stands after a field of a fingerprint that has a default."""
 DEPTH_MAX: Final = 100
@@ -29,7 +29,7 @@ _CLOSING: Final = {"[": "]", "{": "}"}
 
 
 class _Type(NamedTuple):
-    """A type: its name, the kind of bracket behind it, what stands in that, whether `None` may be.
+    """A type: its name, its bracket and the parts in it, and whether it may be `None`.
 
     Of a dataclass (``{``) the parts are fields, else they have no name.
     """
@@ -63,7 +63,7 @@ def succeeds(newer: str, older: str) -> bool:
 
 
 def type_conflict(known: AspectEntry, wanted: AspectEntry) -> str:
-    """Return why a client cannot use an aspect with the type that it wants; "" where it can."""
+    """Return why a client cannot use an aspect with the type that it wants; "" if it can."""
     here, asked = known.fingerprint, wanted.fingerprint
     if same_type(here, asked):
         return ""
@@ -104,7 +104,7 @@ def with_type_of(known: AspectEntry, wanted: AspectEntry) -> AspectEntry:
 
 
 def newest(one: AspectEntry, other: AspectEntry) -> AspectEntry | None:
-    """Return the entry of the newer type of two; None where neither succeeds the other."""
+    """Return the entry of the newer type of two; None if neither succeeds the other."""
     if same_type(one.fingerprint, other.fingerprint):
         return with_type_of(one, other)
     if succeeds(other.fingerprint, one.fingerprint):
@@ -146,7 +146,7 @@ def _has(newer: _Type, older: _Type) -> bool:
 
 
 def _parsed(text: str) -> _Type | None:
-    """Return the type that a fingerprint names; None where it is cut, or nothing of the kind."""
+    """Return the type that a fingerprint names; None if it is cut short or invalid."""
     if "\0" in text:
         return None
     for sign in _SIGNS:

@@ -6,9 +6,9 @@
     ListLocks(after=that)     ─> Locks(…, more=START)              the end
 
 A page ends at `PAGE_BYTES_MAX`, or after `WORK_MAX` units of work, so it may be empty although
-the listing goes on.  The shard keeps nothing between two pages: the cursor holds all, so a client
-that stops asking costs nothing.  An entry that exists all the time comes exactly once; one that is
-added or removed meanwhile may come or not.
+the listing continues.  The shard keeps nothing between two pages: the cursor holds everything, so a
+client that stops asking costs nothing.  An entry that exists all the time is listed exactly once;
+one that is added or removed meanwhile may be listed or not.
 
 Slots go column by column, by name, and within a column as they came: no slot leaves a column but
 with all of its context, so a place in it names the same slot for a whole epoch.
@@ -32,13 +32,13 @@ if TYPE_CHECKING:
 PAGE_BYTES_MAX: Final = 8 << 20
 """Bytes of one page: half of what a header may have, so that an entry may be large, too."""
 WORK_MAX: Final = 2_000
-"""Slots, versions and causes that are looked at for one page: about 5 ms."""
+"""Most slots, versions and causes that are examined for one page: about 5 ms."""
 PATTERNS_WORK: Final = 8
-"""So many patterns are tried in the time that it takes to look at one slot."""
+"""How many patterns can be tried in the time that one slot takes."""
 VERSIONS_OF_A_LOOK: Final = 16
-"""So many versions of one slot are passed over in that time."""
+"""How many versions of one slot can be skipped in that time."""
 HOLDER_WORK: Final = 10
-"""What it takes to describe a lock, which looks for those that are in its way."""
+"""Work to describe a lock, including the search for the locks that block it."""
 
 E = TypeVar("E")
 Step = tuple[E | None, int, int, Cursor]
@@ -81,7 +81,7 @@ def over_slots(
     version_of: Callable[[E], int],
     bytes_of: Callable[[E], int],
 ) -> Iterator[Step[E]]:
-    """Yield what is listed of each slot that is asked for, from a cursor on.
+    """Yield the entries of each requested slot, from a cursor on.
 
     Args:
         slots: All slots.

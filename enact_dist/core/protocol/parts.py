@@ -1,4 +1,4 @@
-"""The parts of which messages are made; see `core.protocol.messages`."""
+"""The parts of several messages; see `core.protocol.messages`."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ class Cursor(NamedTuple):
     """Where a listing continues: made by a shard for itself, and returned to it unchanged.
 
     Epoch 0 means the start in a request, and the end of the listing in an answer.
-    The rest says what comes next: after the entry that `names` and `number` stand for, and of the
-    versions of one slot after `version`.
+    The other fields name the last entry: by `names` and `number`, and among the versions of one
+    slot by `version`.
     """
 
     epoch: int = 0
@@ -22,7 +22,7 @@ class Cursor(NamedTuple):
 
 
 START: Final = Cursor()
-"""The begin of a listing; in an answer: its end."""
+"""The start of a listing; in an answer, its end."""
 
 NO_LIMIT: Final = 1 << 62
 """Represents "no limit"; below the wire's largest integer, since messages may carry it."""
@@ -31,12 +31,12 @@ NO_LIMIT: Final = 1 << 62
 class Item(NamedTuple):
     """One line of a lock or view: `access` is an `enact_dist.terms.Access` number.
 
-    `entity` is a pattern where the access is one of the `…_EACH`.  `known` is the version that
-    the client still has from this epoch (0: none): an unchanged datum is not sent again.
-    With `captured_ns` (a `VIEW`, or the `READ` that stands for one where there is no cut) the
-    newest retained version with that capture stamp is asked instead of the newest one; where there
-    is none, the slot shows as null outside retention.  `nearest` asks for the version whose capture
-    stamp lies nearest to `captured_ns` instead; of two as near, the later one.
+    `entity` is a pattern if the access is one of the `…_EACH`.  `known` is the version that the
+    client still has from this epoch (0: none): an unchanged datum is not sent again.
+    `captured_ns` (in a `VIEW`, or in a `READ` that replaces one because no consistent snapshot was
+    found) asks for the newest retained version with that capture stamp; if there is none, the slot
+    shows as null outside retention.  `nearest` asks for the version whose capture stamp is nearest
+    to `captured_ns`; if two are equally near, for the later one.
     """
 
     access: int
@@ -111,7 +111,7 @@ class DatumRead(NamedTuple):
 
 
 READS_MAX: Final = 1024
-"""Data that one commit names as read; of further ones it says only how many there were."""
+"""Most data that one commit names as read; further ones are only counted."""
 
 
 class Cause(NamedTuple):
@@ -125,8 +125,8 @@ class Cause(NamedTuple):
         pid: Its process.
         stamp_ns: Stamp of the commit.
         held_ns: How long the lock had been held when its commit, or its promise, reached the shard.
-        reads: Every datum that the lock read or viewed, of a pattern those that its block looked
-            at, and each replaced one that it looked at.
+        reads: Every datum that the lock read or viewed; of a pattern, and of replaced data, those
+            that its block accessed.
         reads_left_out: Number of further ones beyond the limit of a message.
         writes: What the commit set on this shard.
     """
@@ -150,10 +150,9 @@ CAUSE_FORK = "fork"
 class VersionEntry(NamedTuple):
     """One version of a slot's history, without its datum.
 
-    `until_ns` is the stamp of the version that replaced it (0: it is the newest; its own stamp
-    where a label keeps it and the next one is forgotten).  `kept` are the labels that pin
-    it.  `cause` is None where it is not known.  What a restart has lost
-    is version 0.
+    `until_ns` is the stamp of the version that replaced it (0: it is the newest; its own stamp if
+    a label pins it and the next one is forgotten).  `kept` are the labels that pin it.  `cause` is
+    None if it is not known.  A version that a restart has lost is version 0.
     """
 
     state: SlotState
@@ -171,7 +170,7 @@ class WorldEntry(NamedTuple):
 
 
 class LaneView(NamedTuple):
-    """The lowest seq of a lane that its client still cares for."""
+    """The lowest seq of a lane that its client still wants."""
 
     lane: int
     seq: int
@@ -195,7 +194,7 @@ class AspectEntry(NamedTuple):
     The rest says how much of each slot's history stays: `retention` versions, the newest one
     included, replaced at most `age_ns` ago, of `size` bytes of replaced data.  0 means not
     stated: if all three are 0, `terms.Retention()` holds, else a figure of 0 means no limit.  Of
-    several requests, the largest counts.
+    several requests, the largest figures count.
     """
 
     name: str
@@ -223,7 +222,7 @@ class Pin(NamedTuple):
 
 
 class PlacementMap(NamedTuple):
-    """Which shards there are and which entities are pinned; `version` names this state."""
+    """The shards of the cell and its pinned entities; `version` names this state."""
 
     version: int
     shards: tuple[ShardEntry, ...]

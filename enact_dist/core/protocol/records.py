@@ -1,4 +1,4 @@
-"""What a shard asks its store to keep, and what the store gives back at start.
+"""Records that a shard stores and recovers, its effects, and its events that are no requests.
 
 A store has one duty: `Persist` is applied whole or not at all, in order, and reported done only
 when it survives what its durability promises.  Everything else is decided in the core.
@@ -18,7 +18,7 @@ from enact_dist.terms import Durability, NullReason
 class SessionRecord:
     """A session that may hold locks: after a restart the grace waits for it.
 
-    `identity` is whose it is ("" where a release that noted none has kept it).
+    `identity` is its owner ("" if an older release, which stored none, has written the record).
     """
 
     session: str
@@ -74,7 +74,7 @@ class AspectForgotten:
 
 @message
 class BasesMoved:
-    """What is known of a context or aspect that is gone, now that entities move; drops nothing."""
+    """The version bases of a dropped context or aspect, when entities move; drops nothing."""
 
     base: WorldDropped | AspectForgotten
 
@@ -223,7 +223,7 @@ class AuditRecord:
 
 @message
 class ForcedRecord:
-    """A prepared lock that was aborted by hand: its primary's word is still to be asked for.
+    """A prepared lock that an operator aborted: its primary must still be asked for its decision.
 
     `slots` are those that it would have written here.
     """
@@ -236,7 +236,7 @@ class ForcedRecord:
 
 @message
 class ForcedEnded:
-    """The primary has given its word about such a lock; forget the record."""
+    """The primary has reported its decision on such a lock; forget the record."""
 
     lock: LockId
 
@@ -372,7 +372,7 @@ class ShardReturned:
 class Served:
     """The daemons that serve a shard at the places of a `Compare`, each by its random start number.
 
-    `text` is for people: where they are, and what to do.
+    `text` is for the operator: where they are, and what to do.
     """
 
     shard: str
@@ -411,7 +411,7 @@ class Drain:
 
 @message
 class MakeRoom:
-    """The cap of shared memory is reached: release so many bytes of history, oldest first."""
+    """The cap of shared memory is reached: release this many bytes of history, oldest first."""
 
     bytes: int
 

@@ -1,4 +1,4 @@
-"""What a client, or another shard, asks a shard; see `core.protocol.messages` for the rules."""
+"""The requests of clients and of other shards; see `core.protocol.messages` for the rules."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Hello:
 class Register:
     """Create world contexts and register aspects, idempotently.  Answer: `Registered`.
 
-    What would be more than a catalogue holds (`core.state.catalogue`) is refused as "overload".
+    More than a catalogue can hold (`core.state.catalogue`) is refused as "overload".
     """
 
     session: str
@@ -78,11 +78,11 @@ class TakeView:
     """Read committed data without a lock.  Answer: `Viewed`, `Forgotten` or `WrongShard`.
 
     Large data stay fetchable for the lock id until it is released or overtaken by its lane.
-    With `at_ns` the data are asked as of that stamp: the shard moves its clock past it, waits (at
-    most a slice) for undecided commits stamped up to it, and goes back to it where it still can.
-    With `strict` it never shows the present instead: what is forgotten is answered `Forgotten`, and
-    a stamp further ahead than clocks may be apart is refused.  Where the answer ends before `at_ns`
-    (`until_ns`), an undecided commit stands in the way: ask again.
+    `at_ns` asks for the data as of that timestamp: the shard moves its clock past it, waits (at
+    most a slice) for undecided commits up to it, and shows that moment if it still can.  With
+    `strict` it never shows the present instead: a forgotten state is answered `Forgotten`, and a
+    timestamp further ahead than clocks may differ is refused.  If the answer ends before `at_ns`
+    (`until_ns`), an undecided commit blocks the view: ask again.
     """
 
     lock: LockId
@@ -109,11 +109,11 @@ class Fetch:
 
 @message
 class KeepAlive:
-    """Renew the session and say what is still wanted.  Answer: `Alive`.
+    """Renew the session and name the locks that are still wanted.  Answer: `Alive`.
 
     The shard frees every grant and waiter of a lane below its `view`: a lost release or an orphan
     grant ends here.  `count` increases with each message of the session; the client remembers when
-    it sent which, and believes in its locks from *sending* times only.
+    it sent which, and trusts its locks by *sending* times only.
     `report` is the actor's own statistics (msgpack), shown by `enact actor ls`.
     """
 
@@ -149,8 +149,8 @@ class Stage:
     """Bring a payload to the shard apart from the commit that will name it.  Answer: `Staged`.
 
     The first one, at offset 0 and without a body, makes room for `total` bytes: on the same host
-    the client then fills the shard's file by itself.  Where it cannot, slices follow, in order or
-    again.  A total of 0 gives the payload up.  Answered by the shard's link, not by its core.
+    the client then fills the shard's file itself.  If it cannot, slices follow, in order; they may
+    be repeated.  A total of 0 discards the payload.  Answered by the shard's link, not its core.
     """
 
     session: str
@@ -169,7 +169,7 @@ class Outcome:
 
 @message
 class Validate:
-    """Is this lock still continuously held?  If so, release it.
+    """Is this lock still held, without interruption?  If so, release it.
 
     Answer: `Valid`, `Fenced` or `Changed`.  A token with number 0 stands for a shard where the lock
     holds nothing but expects something.
@@ -234,9 +234,9 @@ class Goodbye:
 class AwaitStamp:
     """Wait until all commits up to a stamp are visible.  Answer: `Reached` (maybe not yet).
 
-    Only a session is waited for, in the epoch that it knows, at most `WAIT_SLICE_NS_MAX`; without
-    one the answer comes at once.  Of a session that asks more than 64 such questions, the oldest
-    one is answered early.
+    The shard waits only for a session, in the epoch that it knows, at most `WAIT_SLICE_NS_MAX`;
+    without one it answers at once.  If a session has more than 64 such questions, the oldest one is
+    answered early.
     """
 
     stamp_ns: int
@@ -254,7 +254,7 @@ class Ping:
 class ListPlaces:
     """Where does the shard expect each shard of the cell?  Answer: `Places`; no session is needed.
 
-    A shard that serves says in `shard` who it is (then only that shard itself may ask), and in
+    A serving shard gives its own name in `shard` (then only that shard itself may ask), and in
     `shards` where it expects each shard, itself included.
     """
 
@@ -268,7 +268,8 @@ class Survey:
 
     Empty `contexts` or `aspects` mean all; `patterns` are entity patterns, empty means all.
     With `retained` the retained versions of each slot come before its newest one, oldest first.
-    A listing of several pages is no cut: each page shows its slots as they are when it is asked.
+    A listing of several pages is no consistent snapshot: each page shows its slots as they are when
+    it is requested.
     """
 
     contexts: tuple[str, ...]
@@ -294,7 +295,7 @@ class ListSessions:
 
 @message
 class Break:
-    """Take a lock away by its grant number, by hand.  Answer: `Broken`.
+    """Take a lock away by its grant number, on behalf of an operator.  Answer: `Broken`.
 
     A restarted shard starts its numbers again: `epoch` is the one in which the number was read (0:
     not stated), so a late copy breaks no other lock.
@@ -307,10 +308,10 @@ class Break:
 
 @message
 class ForceAbort:
-    """Give up a prepared lock whose primary is lost for good, by hand.  Answer: `Broken`.
+    """Abort a prepared lock whose primary is permanently lost.  Answer: `Broken`.
 
-    If the primary had decided to commit after all, the commit is torn: only for an operator who
-    knows that it never comes back.  `epoch` is that of `Break`.
+    If the primary had decided to commit after all, only a part of the commit takes effect.  Only
+    for an operator who knows that the primary never comes back.  `epoch` is that of `Break`.
     """
 
     number: int
@@ -322,9 +323,9 @@ class ForceAbort:
 class ListAudit:
     """List what operators did here.  Answer: `Audited`.
 
-    A text in `settle` says that a person has seen to all alarms so far, and how.  `seen_ns` is the
-    wall-clock stamp of the newest act that this person had seen (0: unsaid): a late copy settles
-    no alarm that came since.
+    A text in `settle` acknowledges all alarms so far and describes how they were settled.
+    `seen_ns` is the wall-clock stamp of the newest act that the operator had seen (0: unknown), so
+    a late copy settles no later alarm.
     """
 
     settle: str
@@ -354,7 +355,7 @@ class ListHistory:
 class Explain:
     """Ask for these versions with their causes (version 0: the newest).  Answer: `Versions`.
 
-    What is forgotten is left out.
+    Forgotten versions are left out.
     """
 
     versions: tuple[SlotVersion, ...]
@@ -373,12 +374,12 @@ class FindEffects:
 class Fork:
     """Make a world context with the data of `source` as of a stamp.
 
-    Answer: `Forked`, `Forgotten`, or `Refused` where the world is there and no such fork.
+    Answer: `Forked`, `Forgotten`, or `Refused` if the context exists and is no such fork.
 
-    Copies no data.  Idempotent: the same fork again is answered the same.  Like a view as of a
-    stamp it waits a little for undecided commits; where that is not enough, it is refused as
-    "overload" and may be asked again.  `epoch` and `count` are those of `Acquire`: with them a
-    copy that comes late makes no context that was dropped meanwhile (0: unsaid).
+    Copies no data.  Idempotent: a repeated request gets the same answer.  Like a view as of a
+    timestamp it waits a little for undecided commits; if that is not enough, it is refused as
+    "overload" and may be repeated.  `epoch` and `count` are those of `Acquire` (0: unknown): with
+    them a late copy does not recreate a context that was dropped meanwhile.
     """
 
     session: str
@@ -407,9 +408,9 @@ class DropWorld:
 class KeepVersions:
     """Pin versions under a label; without versions: unpin those of the label.
 
-    Answer: `Kept`.  Asked again with the same label, versions are added.  `epoch` and `count` are
+    Answer: `Kept`.  A second request with the same label adds versions.  `epoch` and `count` are
     those of `Fork`: a late copy pins nothing that was unpinned since.  With `after` it changes
-    nothing and asks for the next page of what the label keeps.
+    nothing and asks for the next page of the pinned versions.
     """
 
     session: str
