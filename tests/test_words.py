@@ -31,7 +31,7 @@ AMERICAN = {
     r"(?:travel|label|model|cancel|signal)(?:ed|ing)": "with ll",
 }
 """American forms; the repository writes British English."""
-LEFT: dict[str, int] = {"enact_dist/verify": 45}
+LEFT: dict[str, int] = {}
 """How many are left in each part.  This list can only shrink: the test compares exactly."""
 _WRONG = re.compile(rf"\b(?:{'|'.join((*BANNED, *AMERICAN))})\b", re.IGNORECASE)
 _CODE = re.compile(r"^```.*?^```|`[^`\n]*`", re.MULTILINE | re.DOTALL)
