@@ -1,6 +1,6 @@
 """Was everything that committed strictly serializable?  Judges a history, wherever it comes from.
 
-A history is what each lock read, wrote and was told (`LockStory`), and for each slot the states
+A history is what each lock read, wrote and had as answers (`LockStory`), and per slot the states
 that it went through, oldest first (`State`).  Slot versions give the exact dependencies: who wrote
 after whom (ww), who read whose write (wr), whose read was overwritten by whom (rw).  Real time
 gives the rest: what ended before another began comes before it.  An order exists exactly if the
@@ -203,7 +203,7 @@ class Checker:
                 elif state.version != before + 1:
                     yield Anomaly("versions have a gap", (f"{slot}: {state} after {before}",))
                 if state.writer not in self._stories:
-                    yield Anomaly("written by nobody", (f"{slot}: {state}",))
+                    yield Anomaly("written by no lock", (f"{slot}: {state}",))
                 before = state.version
 
     def told_anomalies(self) -> Iterator[Anomaly]:
@@ -324,7 +324,7 @@ class Checker:
     def _add_read(self, story: LockStory, slot: Slot, name: Name) -> None:
         index = self._positions.get(slot, _ONLY_NOTHING).get(name)
         if index is None:
-            return  # a dirty read, which is told as such
+            return  # a dirty read, which is reported as such
         chain = self._chains.get(slot, ())
         if index >= 0:
             self._edge(chain[index].writer, story.id, "wr", slot)

@@ -32,7 +32,7 @@ COMMAND: Final = "enact_dist.cli.main"
 
 
 class KeptPorts:
-    """TCP ports of the loopback that the system gives nobody else before `close`.
+    """TCP ports of the loopback that the system gives to no other process before `close`.
 
     One that was only found free may be another's before the own daemon listens, or while that is
     killed and started again.  A socket that is bound to it and never listens keeps it; a daemon

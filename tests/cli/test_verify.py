@@ -59,11 +59,11 @@ def test_failure_is_told_with_a_short_schedule_and_its_command(enact, monkeypatc
 
 
 def test_one_seed_tells_its_story(enact):
-    """Faults with their names, locks with what they asked for and were told."""
+    """Faults with their names, locks with what they asked for, and how they ended."""
     result = enact("verify", "--seed", "5")
 
     assert result.status == 0
-    for text in ("s0 starts with epoch", "[", "asks for", "is told committed", "faults end"):
+    for text in ("s0 starts with epoch", "[", "asks for", "ends as committed", "faults end"):
         assert text in result.out
 
 

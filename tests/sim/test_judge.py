@@ -121,7 +121,7 @@ def test_i13_grant_past_an_earlier_waiter_is_seen():
 
     original = judge.judge
     judge.judge = later_grant
-    assert scenario.run().rule == "I13 nobody is overtaken"
+    assert scenario.run().rule == "I13 no lock is overtaken"
     assert looked
 
 

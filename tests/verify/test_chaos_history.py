@@ -183,7 +183,7 @@ def test_deleted_datum_is_a_state_of_its_deleter(recorded):
     assert recorded.rules() == []
 
     recorded.lock("b.3", reads=[(KEPT, 4, "")])
-    assert "written by nobody" in recorded.rules()
+    assert "written by no lock" in recorded.rules()
 
 
 def test_volatile_slot_starts_anew_with_its_shard(recorded):

@@ -180,7 +180,7 @@ def test_writer_that_is_not_there_is_named(told):
     """Whatever is in a slot was put there by a lock."""
     told.chain("x", "a")
 
-    assert told.rules() == ["written by nobody"]
+    assert told.rules() == ["written by no lock"]
 
 
 def test_circle_of_writes_is_named(told):

@@ -1,11 +1,11 @@
 """From the journals of a run to a history: which states each slot went through.
 
 No journal shows a shard's inside.  What a slot held is known from those who looked, the last lock
-over everything among them, and from those who wrote: a version that nobody saw belongs to the lock
-that was told that it committed it, or else to the only one that may have.  A lock whose end is
+over everything among them, and from the locks that wrote: an unseen version belongs to the lock
+whose commit was confirmed, or else to the only one that may have made it.  A lock whose end is
 unknown counts as soon as one of its versions was seen.
 
-A volatile slot counts its versions anew after each restart, so it is told restart by restart.  A
+A volatile slot counts its versions anew after each restart, so its chain is made anew, too.  A
 commit over several shards that was promised before a restart may be applied after it, always as
 version 1, which may be another one than was promised.  A commit on one shard never is.
 """
@@ -108,7 +108,7 @@ class History:
             seen.setdefault(at, {})[writer] = None
 
     def _note_viewed(self) -> None:
-        """Take the views of volatile slots, which know no epoch, where nobody else has looked."""
+        """Take the views of volatile slots, which know no epoch, where no other client looked."""
         known = {(slot, w) for slot, seen in self._seen.items() for ws in seen.values() for w in ws}
         for (slot, writer), views in self._viewed.items():
             if (slot, writer) in known:
@@ -118,7 +118,7 @@ class History:
             for _, version in views:
                 epoch = written
                 if version != promised:
-                    # Applied after a restart: the next one, as nobody saw it in a later epoch.
+                    # Applied after a restart: the next one, as no client saw it in a later epoch.
                     later = (r.epoch for r in self._restarts[_shard_of(slot)] if r.epoch > written)
                     epoch = min(later, default=written)
                 elif shown is not None and self._may_outlive(writer, version):
@@ -128,7 +128,7 @@ class History:
     def _shown_later(self, slot: str, writer: str, views: list[LockRecord]) -> int | None:
         """Return the epoch in which the first view showed a write, if its promise was older.
 
-        None where a view showed the write in the epoch of its promise, or somebody found there
+        None where a view showed the write in the epoch of its promise, or a client found there
         what followed it: then it was applied there, and the restart has emptied the slot.
         """
         written, promised = self._claimed.get((writer, slot), (_FIRST, 0))
@@ -143,7 +143,7 @@ class History:
         """Return the epoch in which a lock was shown its view of a slot; None: one of several.
 
         The views of a lock are taken between its begin and its grant.  A shard that ends by itself
-        answers some while after it was told to, and none answers before it was started.
+        answers some while after its order, and none answers before it was started.
         """
         restarts = self._restarts[_shard_of(slot)]
         for one, then in pairwise(restarts):
@@ -187,7 +187,7 @@ class History:
     def _emptied_by(self, restart: Restart, slot: str) -> str:
         """Return who set a volatile slot to null at a restart.
 
-        A promise holds over it: its commit may have been told before the restart and be applied
+        A promise holds over it: its commit may be confirmed before the restart and be applied
         after it, or after a later one, so of this slot nothing says when it was emptied.
         """
         first = self._seen[slot].get((restart.epoch, 1), ())
@@ -227,7 +227,7 @@ class History:
     def _may_be(
         self, slot: str, at: tuple[int, int], found_at: dict[str, tuple[int, int]]
     ) -> list[tuple[LockRecord, str]]:
-        """Return who may have written a version that nobody saw; who was told so comes alone."""
+        """Return which locks may have written an unseen version; a confirmed one comes alone."""
         claims = [
             (record, writer)
             for record, writer in self._claims.get(slot, {}).get(at, ())
@@ -253,7 +253,7 @@ class History:
             return State(writer or f"null {version}", record.id, version)
         name = f"null {version}" if null else f"unseen {at[0]} {version}"
         if null and not claims:
-            return State(name, f"nobody's {slot} {version}", version)
+            return State(name, f"an unknown lock's {slot} {version}", version)
         guess = f"one of {[record.id for record, _ in claims]} at {slot} {version}"
         self.guessed[guess] = None
         return State(name, guess, version)
@@ -285,7 +285,7 @@ class History:
         if writer not in ("", UNSEEN):
             return Reading(slot, writer)
         if _is_volatile(slot) and not protected:
-            return None  # null in which epoch, nobody knows
+            return None  # null in an unknown epoch
         at = (_epoch(record, slot), version)
         if version == 0:
             return Reading(slot, self._names[slot].get(at, NOTHING))

@@ -110,7 +110,7 @@ def _print(verdict: Verdict) -> None:
     ]
     rows += [(f"outcome: {name}", n) for name, n in verdict.outcomes.items()]
     rows += [(f"shards: {name}", n) for name, n in verdict.counters.items()]
-    rows += [("versions nobody saw, of several", verdict.guessed)]
+    rows += [("unseen versions, of several possible writers", verdict.guessed)]
     rows += [("anomalies", len(verdict.anomalies))]
     print_table(("what", "count"), rows, empty="nothing happened")
     print()

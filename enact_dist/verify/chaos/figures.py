@@ -1,6 +1,6 @@
 """Figures of a run: what happened how often, and how long locks were away after something died.
 
-Recovery is told where nothing else was in the way: a restart, a death, a lock in doubt that met
+Recovery counts where no other fault interferes: a restart, a death, a lock in doubt that met
 another fault of the shards or links concerned counts from that fault's end, or not at all.
 """
 

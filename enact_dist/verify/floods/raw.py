@@ -207,7 +207,7 @@ class RawSocket:
     Args:
         welcome: What the shard has said to a hello over Zenoh: it names the folder.
         tally: Where answers are counted.
-        session: For whom the connection says that it speaks; empty: it says nothing at all.
+        session: The session that the connection names in its greeting; empty: it sends no greeting.
 
     Raises:
         LinkError: The shard shares no folder with this process.

@@ -1,7 +1,7 @@
 """The honest client of a flood: `victim CELL UPDATES CARRIER`.
 
 It counts a number up under a lock, each time from what it counted to itself, while another thread
-holds a second lock; both are in plain sight of the attacker.  What it is told, and what it says:
+holds a second lock; both are in plain sight of the attacker.  What it reads, and what it prints:
 
 ========  ======================================================================================
 (start)   ``held SESSION`` once its second lock is granted

@@ -107,7 +107,7 @@ class Injector:
     def _crash(self, host: ShardHost, luck: Random) -> str:
         power_cut = luck.random() < self._faults.power_cut
         down_ns = luck.choice((20 * MS, 20 * MS, 300 * MS, 2 * S))
-        # A link that breaks is often noticed at once, and then nobody waits for an answer.
+        # A link that breaks is often noticed at once, and then no client waits for an answer.
         notices = luck.getrandbits(self._cell.clients + 1)
         if self._over or not host.up:
             return ""
@@ -130,7 +130,7 @@ class Injector:
         self._world.tally["drains"] += 1
         host.receive(partial(host.event, Drain()))
         self._world.after(delay_ns, partial(self._end_drained, host, host.life, luck))
-        return f"{host.name} is told to stop, ends after {delay_ns // MS} ms, back 300 ms later"
+        return f"{host.name} gets SIGTERM, ends after {delay_ns // MS} ms, back 300 ms later"
 
     @staticmethod
     def _end_drained(host: ShardHost, life: int, luck: Random) -> None:

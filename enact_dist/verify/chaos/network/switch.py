@@ -14,7 +14,7 @@ count    nothing; says `count` and a JSON object of `Counts` in place of `done`
 =======  =========================================================================================
 
 It ends with its standard input.  A kernel need not have a queueing discipline for any of this
-(many lack netem), and nobody needs `/dev/net/tun`: the frames come through packet sockets.
+(many lack netem), and no host needs `/dev/net/tun`: the frames come through packet sockets.
 """
 
 from __future__ import annotations

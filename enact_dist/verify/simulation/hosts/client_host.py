@@ -1,7 +1,7 @@
 """The process around one real `Client`: its calls, its keep-alives and its threads.
 
 A thread is a generator that yields what it waits for: `Sleep`, or `Calls` whose answers it is then
-sent, None for each that nobody answered in time.  It drives `MultiLock` as `link.client` does.
+sent, None for each that no shard answered in time.  It drives `MultiLock` as `link.client` does.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Time and processes: one queue of events in true time, and hosts with clocks of their own.
 
-True time is what nobody in the simulation can read.  Each host has a clock that runs up to 1 %
+True time is what no host in the simulation can read.  Each host has a clock that runs up to 1 %
 fast or slow, and a wall clock that may be set.  A host that is paused keeps what arrives and
 handles it when it goes on; a host that was restarted has a new life, and whatever an older life
 had scheduled is void.

@@ -101,7 +101,7 @@ class Graph:
         found = self._positions.get(slot, {}).get(name, ())
         indices = [index for since, index in found if since <= epoch]
         if name == NEVER_SET.name:
-            # Nobody has a lock in a context while it is dropped.
+            # No client has a lock in a context while it is dropped.
             drops = self._drops.get(slot, ())
             indices += [index for drop, index in drops if self._events[drop][0] < entry.begun_ns]
         return max(indices, default=NOTHING)

@@ -1,4 +1,4 @@
-"""The rules of locks at one shard: I1, I8, I10, I11, I13, I14, I17, ends, nobody waits in vain."""
+"""The rules of locks at one shard: I1, I8, I10, I11, I13, I14, I17, ends, no lock waits in vain."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class LockJudge:
             if other.lock in picture.granted:
                 self._fail("I1 no conflicting grants", lock, other.lock)
             if other.token is None and picture.arrivals[other.lock] < arrival:
-                self._fail("I13 nobody is overtaken", other.lock, "by", lock)
+                self._fail("I13 no lock is overtaken", other.lock, "by", lock)
         picture.newest_token = token
         picture.granted[lock] = picture.granted_ever[lock] = token
 
@@ -123,7 +123,7 @@ class LockJudge:
             ]
             closed = state.draining or state.sessions.in_grace(state.now_ns)
             if not waits[waiter.lock] and not closed:
-                self._fail("P6 nobody waits in vain", waiter.lock, waiter.items)
+                self._fail("P6 no lock waits in vain", waiter.lock, waiter.items)
         for lock in waits:
             self._check_circle(lock)
 

@@ -304,7 +304,7 @@ class Model(Observations):
         if persist is not None and not any(
             kept is persist for kept in reversed(host.disk.log[: host.disk.synced])
         ):
-            self.fail("an end is on disk before it is told", lock)
+            self.fail("an end is on disk before it is confirmed", lock)
 
     def _finished(self, host: ShardHost, notice: Notice, picture: Picture) -> None:
         """A participant has applied what it had prepared."""
@@ -372,7 +372,7 @@ class Model(Observations):
         kept = host.disk.synced if Durability.DURABLE in strictest else host.disk.written
         log = host.disk.log
         if persist is None or not any(log[i] is persist for i in range(kept - 1, -1, -1)):
-            self.fail("P5 on disk before it is told", lock, strictest)
+            self.fail("P5 on disk before it is confirmed", lock, strictest)
 
     def _apply(
         self,

@@ -29,7 +29,7 @@ class State(NamedTuple):
 
 DROP = "drop of "
 """So begins the writer of the state in which a dropped context leaves its slots."""
-NEVER_SET = State(0, 0, "nobody", 0, None)
+NEVER_SET = State(0, 0, "no lock", 0, None)
 
 
 @dataclass(slots=True)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from enact_dist.verify.simulation.judges.history import Observations
     from enact_dist.verify.simulation.judges.picture import Picture
 
-OUTSIDE: Final = State(0, 0, "nobody", 0, None)
+OUTSIDE: Final = State(0, 0, "no lock", 0, None)
 """What stands for a version that is not retained."""
 
 
@@ -176,7 +176,7 @@ class ReaderJudge:
 
 
 def stamp_of(datum: Datum | None) -> int:
-    """Return when a datum was captured, 0 where nobody said or there is none."""
+    """Return when a datum was captured, 0 if it has no stamp or there is none."""
     return datum.stamp_ns if datum is not None else 0
 
 

@@ -45,13 +45,13 @@ class WorldJudge:
                 world = host.shard.state.catalogue.worlds[answer.world]
                 wanted = WorldRecord(*world)
                 if not any(record == wanted for record in _on_disk(host)):
-                    self._fail("a fork is on disk before it is told", host.name, world)
+                    self._fail("a fork is on disk before it is confirmed", host.name, world)
                 self._made(host, world, picture)
             elif isinstance(answer, Dropped) and answer.world in picture.worlds:
                 self._dropped(host, answer.world, picture)
         for world in host.shard.state.catalogue.shown().forks:
             if picture.worlds.get(world.name) != world:
-                self._fail("a fork is there when it is told", host.name, world)
+                self._fail("a fork is there when it is confirmed", host.name, world)
 
     def explains(self, notice: Notice) -> bool:
         """Whether a notice tells of a fork or a drop of this step; it must do so rightly."""
@@ -59,13 +59,13 @@ class WorldJudge:
             return False
         for change in notice.changes:
             if self._to_tell.pop(change.slot, None) != (change.version, change.null):
-                self._fail("watchers are told of forks and drops", change)
+                self._fail("watchers learn of forks and drops", change)
         return True
 
     def check_told(self) -> None:
-        """All that changed in this step was told."""
+        """Watchers have learnt of all that changed in this step."""
         if self._to_tell:
-            self._fail("watchers are told of forks and drops", self._to_tell)
+            self._fail("watchers learn of forks and drops", self._to_tell)
 
     def _made(self, host: ShardHost, world: WorldEntry, picture: Picture) -> None:
         """A fork is there: it has what its source had, and nothing else."""
@@ -75,7 +75,7 @@ class WorldJudge:
             if source.version and slot not in found:
                 self._fail("a fork has all that its source had", slot, source)
         for slot, content in found.items():
-            # What a crash took of a first volatile write leaves a null slot that nobody has seen.
+            # What a crash took of a first volatile write leaves an unseen null slot.
             self._check_slot(slot, content, wanted.get(slot, NEVER_SET), world, picture)
             self._put(slot, content, world, picture)
             self._to_tell[slot] = (content.version, content.datum is None)
@@ -115,17 +115,17 @@ class WorldJudge:
         picture.restarts.append((_writer(world), now_ns, now_ns))
 
     def _dropped(self, host: ShardHost, name: str, picture: Picture) -> None:
-        """A context is gone: nobody was in it, and nothing is left but the base of versions."""
+        """A context is gone: no client was in it, and nothing is left but the base of versions."""
         for tenure in host.shard.state.tenures.by_lock.values():
             if any(item.context == name for item in tenure.items):
-                self._fail("nobody has a lock in a context that goes", name, tenure.lock)
+                self._fail("no client has a lock in a context that goes", name, tenure.lock)
         left = next(iter(host.shard.state.slots.of_context(name)), None)
         if left is not None:
             self._fail("nothing is left of a dropped context", left)
         records = (r for r in _on_disk(host) if isinstance(r, WorldDropped) and r.name == name)
         record = next(records, None)
         if record is None:
-            self._fail("a drop is on disk before it is told", host.name, name)
+            self._fail("a drop is on disk before it is confirmed", host.name, name)
         else:
             for slot, state in _of_context(picture, name):
                 if state.datum is not None:

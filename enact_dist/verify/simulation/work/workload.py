@@ -52,7 +52,7 @@ PLAIN = ("count", "note", "frame")
 ENTITIES = ("piece", "bench", "tray/4", "tray/7")
 """They lie on different shards, by twos and on all of three: a test looks after that."""
 LABELS = 40
-"""Things that creators look for, and create when nobody has: about as many as there are looks."""
+"""Things that creators look for, and create when no other has: about as many as there are looks."""
 KINDS = {
     "increment": 26,
     "derive": 14,
@@ -292,7 +292,7 @@ class Workload:
                 yield from self._finish(host, entry, job, data)
             yield from host.drive(lock)
         self._history.end(entry, now_ns=self._world.now_ns)
-        self._world.tell(job.name, "is told", entry.told.value if entry.told else "-", lock.cause)
+        self._world.tell(job.name, "ends as", entry.told.value if entry.told else "-", lock.cause)
         self._model.of_clients.told(host, entry)
         if lock.no_cut:
             self._world.tally["views that became reads"] += 1
