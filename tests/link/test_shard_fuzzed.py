@@ -221,6 +221,7 @@ CLIENT = """
 import sys
 from enact_dist.wire import frames
 frames.FRAME_VERSION -= 1
+frames._VERSION = bytes((frames.FRAME_VERSION,))
 from enact_dist import connect
 connect(sys.argv[1])
 """
