@@ -5,6 +5,7 @@ import random
 import secrets
 import sys
 import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -39,6 +40,9 @@ def raw(endpoint):
     def ask(*frames):
         if not opened:
             opened.append(open_session(connect=(endpoint,), lease_s=30.0))
+            ping, key = encode_frame(m.Ping())[0], request_key("cell", "s0", "ping", "fuzz")
+            while not [*opened[0].get(key, attachment=ping, timeout=1.0)]:
+                time.sleep(0.005)  # until the shard's queryable is known here
         sent = [
             opened[0].get(
                 request_key("cell", "s0", verb(header, payload), "fuzz"),
@@ -221,6 +225,7 @@ CLIENT = """
 import sys
 from enact_dist.wire import frames
 frames.FRAME_VERSION -= 1
+frames._VERSION = bytes((frames.FRAME_VERSION,))
 from enact_dist import connect
 connect(sys.argv[1])
 """
