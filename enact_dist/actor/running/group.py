@@ -5,7 +5,7 @@ may share one: `process = "camera-3"` in the table of each in `cell.toml`.  What
 interpreter, its environment, and the memory of what they import.  Each has its own
 
   * session: its locks, its lease, its report, its name in `enact actor ls` and `enact why`.  An
-    actor whose lease is lost, or that ends, takes no lock of another with it;
+    actor whose lease is lost, or that ends, costs no other actor a lock;
   * end: an actor that fails, is done or is restarted (`enact actor restart`) leaves the others
     running.  It is restarted as `enact up` restarts a process: after a growing pause, but not
     once it is done or cannot run as configured;
@@ -166,7 +166,7 @@ class Life:
         self._why = ""
 
     def begin(self, doing: Doing) -> None:
-        """Note that the actor is about to run; `doing` tells what it does."""
+        """Note that the actor is about to run; `doing` shows what it is doing."""
         drain = ActorDrain(self._name, doing, self._drain_s, self._leave)
         with self._mutex:
             self._drain, why = drain, self._why
@@ -301,7 +301,7 @@ class ActorGroup:
         self._heard_of(name)
 
     def _again(self, name: str, status: int, pauses: RestartPauses) -> bool:
-        """Tell of the end of an actor; wait and return True where it is to be started again."""
+        """Log the end of an actor; if it is to be restarted, wait and return True."""
         if status == DONE:
             log.info("actor %s is done; it is not started again", name)
             return False
@@ -321,7 +321,7 @@ class ActorGroup:
         self._heard_of(name)
 
     def _heard_of(self, name: str) -> None:
-        """Tell once that the process is ready: each actor has been, or has ended."""
+        """Report the process as ready once each actor has been ready or has ended."""
         with self._changed:
             last = self._unready == {name}
             self._unready.discard(name)
@@ -341,7 +341,7 @@ class ActorGroup:
         self._leave_if_cut()
 
     def _leave_if_cut(self) -> None:
-        """End the process once nothing but what was cut off is left in it."""
+        """End the process once only actors that were cut off are left in it."""
         with self._changed:
             leaves = bool(self._kept) and self._kept <= self._cut
         if leaves:
