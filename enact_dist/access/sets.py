@@ -1,4 +1,4 @@
-"""Which sets of data that belong together an actor still has to look at; which are incomplete.
+"""The sets of data of a `Together`: which are complete and wait for a run, which stay incomplete.
 
 PURE: time arrives as an argument.  Rules that a change must keep:
 
@@ -9,14 +9,14 @@ PURE: time arrives as an argument.  Rules that a change must keep:
    members.
 3. One that is over, or older than `least_after_ns` by the actor's clock, and has `least` of its
    data runs without the others: that is counted, too (`partial`).
-4. What can be in no set is counted too: a datum without a stamp, one whose set is over (`late`), a
-   second one for the same set (`skipped`), a complete set that newer ones pushed out (`skipped`).
+4. Data that fit no set are counted, too: a datum without a stamp, one whose set is over (`late`), a
+   second one for the same set (`skipped`), a complete set that newer ones replaced (`skipped`).
    With `newest_only` a set is skipped, too, if a newer one may run before it, or if it is older
    than the last one that ran.
-5. What was incomplete before the actor started is not its business: at the start only the newest
+5. Sets that were incomplete before the actor started are ignored: at the start only the newest
    complete set runs.
 6. Stamps of one member grow.  Where those of more than half of the members fall by more than
-   `SET_BACK_NS`, the clock of their sensors was set back: sets are counted anew from there.  One
+   `SET_BACK_NS`, the clock of their sensors was set back: counting starts again from there.  One
    member alone that falls back is late, as in rule 4.
 """
 
@@ -254,7 +254,7 @@ class PendingSets:
             self._arrived(member, captured_ns, now_ns)
 
     def _notice_set_back(self) -> None:
-        """Count anew where the sensors' clock was set back (rule 6)."""
+        """Start counting again where the sensors' clock was set back (rule 6)."""
         each = list(zip(self._last, self._newest, strict=True))
         back = [last_ns for last_ns, newest_ns in each if last_ns < newest_ns - SET_BACK_NS]
         if 2 * len(back) <= len(each):
@@ -317,7 +317,7 @@ class PendingSets:
         )
 
     def _close(self, one: _Set) -> None:
-        """Remember that a set is over; of very old ones only that they are."""
+        """Remember that a set is over; very old ones are remembered as a whole, by a floor."""
         self._open.remove(one)
         self._over.append(one)
         while len(self._over) > 4 * self._open_max:

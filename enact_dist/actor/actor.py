@@ -10,8 +10,8 @@ What a run promises to `update(self, lock)`:
 - It is called with the newest data, by one thread at a time.
 - It may be called again for a datum that it has seen: at each start (once per existing entity),
   after its lock was lost (`hold_s` has passed, or the shard was away for long), and after a commit
-  whose answer was lost.  So an update sets results that follow from its inputs; it does not count
-  calls and moves nothing.  An actor that moves something sets `once = True`.
+  whose answer was lost.  So an update computes its results from its inputs; it neither counts calls
+  nor moves anything.  An actor that moves something sets `once = True`.
 
 Departure from ENACT 3.1: the paper's actor owns a fixed set of entities E_a; here E_a is a name
 pattern, because its own 4.2 meets new entities at run time.

@@ -66,10 +66,10 @@ _JOINED: Final = "_enact_joined"
 
 
 def joined(actor: Actor) -> Joined:
-    """Return where an actor runs: for what is done beside its lock, such as a fork.
+    """Return where an actor runs, for operations outside its lock, such as a fork.
 
-    A thread that holds a lock, as `update` does, can neither fork nor drop a world context: it lets
-    another thread do so.
+    A thread that holds a lock, as `update` does, can neither fork nor drop a world context; another
+    thread has to do it.
 
     Raises:
         MisuseError: It does not run yet.

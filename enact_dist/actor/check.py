@@ -27,10 +27,10 @@ advice   durable stream       data that are written ten times a second or more, 
                               disk as nothing says how durable they are
 =======  ===================  ===================================================================
 
-World contexts and aspects are checked only against a list that is given, types against each other:
-no shard is asked, and an actor whose type a shard knows otherwise is refused at its start.  What a
-patterned write without `Each` can reach is narrowed by what triggers its actor only as far as the
-pattern says.
+World contexts and aspects are checked against the given list only, types against each other.  The
+check contacts no shard; an actor whose datum type differs from the one that a shard knows is
+refused when it starts.  A write of a pattern without `Each` is assumed to reach all that the
+pattern matches, whatever triggers its actor.
 """
 
 from __future__ import annotations
@@ -120,8 +120,9 @@ def check_cell(config: CellConfig, *, initial: Collection[str] = ()) -> tuple[Ac
     """Check all actors that a `cell.toml` configures: that they load, and `check_actors`.
 
     No actor is made; only its module is imported.  An actor without `worlds` in the file has each
-    role bound to the world context of its name, as running it does.  The file's list of aspects
-    names those whose durability differs, so an aspect that it does not list is no finding.
+    role bound to the world context of its name, as running it does.  A `cell.toml` lists only
+    aspects that differ from what the actors declare, so an aspect that it does not list is no
+    finding.
 
     Args:
         config: The cell.
@@ -193,7 +194,7 @@ def _of_options(actor_class: type[Actor], options: Mapping[str, object]) -> type
 def _sets(
     actors: Iterable[ActorDeclaration], configured: Mapping[str, AspectEntry]
 ) -> Iterator[ActorFinding]:
-    """Find sets of data that have no history, by the word of `cell.toml` or of the actor."""
+    """Find sets of data without history, as `cell.toml` or the actor declares their retention."""
     for actor in actors:
         together = actor.actor_class.declaration.together
         for request in together.requests if together is not None else ():
@@ -355,7 +356,7 @@ def _unwritten(uses: Sequence[Use], initial: Collection[str]) -> Iterator[ActorF
 
 
 def _unstamped_sets(uses: Sequence[Use]) -> Iterator[ActorFinding]:
-    """Find data of a `Together` whose writers are known and set no capture stamp."""
+    """Find data of a `Together` whose known writers set no capture stamp."""
     stamping = _stamping(uses)
     for use in uses:
         together = use.actor.actor_class.declaration.together
@@ -406,7 +407,7 @@ def _streams(uses: Sequence[Use], said: Collection[str]) -> Iterator[ActorFindin
 
 
 def _stamping(uses: Sequence[Use]) -> set[str]:
-    """Return the names of the actors whose data bear a capture stamp, or may."""
+    """Return the names of the actors whose data have a capture stamp, or may have one."""
     found = {
         use.actor.name for use in uses if use.actor.period_s is not None or _says_stamps(use.actor)
     }

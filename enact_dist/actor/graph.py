@@ -42,11 +42,11 @@ class Group:
     """Actors that are drawn as one box.
 
     Attributes:
-        key: What tells it from others.
+        key: What distinguishes it from others.
         title: Its class.
         names: Its actors.
         note: When they run, and how often they do if that is known.
-        layer: Number of groups that data pass before they come to this one.
+        layer: Number of groups that data pass before they reach this one.
     """
 
     key: str

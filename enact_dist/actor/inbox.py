@@ -1,10 +1,10 @@
 """How changes reach a running actor: one watch per world context.
 
-An actor with one watch follows it by its own thread while it has nothing else to do: no other
-thread has to be woken first, and what comes during an update waits in the watch's feed.  Of several
-watches each has a thread that only fills the actor's inbox, since a watch blocks.  A watch whose
-shard is away is opened again with growing pauses; its snapshot then repeats what is known, which
-`PendingTriggers` passes over.
+An actor with one watch follows it in its own thread while it is idle: no other thread has to be
+woken first, and changes that arrive during an update wait in the watch's feed.  If there are
+several watches, each has a thread that fills the actor's inbox, because a watch blocks.  A watch
+whose shard is away is opened again after growing pauses; its snapshot then repeats known states,
+which `PendingTriggers` ignores.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ P = TypeVar("P", PendingTriggers, PendingSets)
 
 
 class _Box(Generic[P]):
-    """What is pending; the watching threads fill it, the actor's thread empties it."""
+    """Pending runs: watching threads add changes, the actor's thread takes runs."""
 
     def __init__(self, pending: P) -> None:
         self._pending: P = pending
@@ -125,7 +125,7 @@ class Inbox(_Box[PendingTriggers]):
                 self._filled.notify_all()
 
     def used(self, states: Mapping[tuple[int, Entity], Hashable]) -> None:
-        """Take note of the states that an update that just ended has seen already."""
+        """Note which states the update that has just ended had seen."""
         with self._filled:
             for (source, entity), state in states.items():
                 self._pending.used(source, entity, state)
@@ -216,7 +216,7 @@ class SetInbox(_Box[PendingSets]):
         }
 
     def tell_left(self) -> None:
-        """Tell of the incomplete sets that were only counted so far."""
+        """Log the incomplete sets that have only been counted so far."""
         with self._filled:
             left = self._repeated.left()
         for count, newest in left:
@@ -224,7 +224,7 @@ class SetInbox(_Box[PendingSets]):
 
 
 def _tell(line: str, count: int | None) -> None:
-    """Write a line about an incomplete set: the first, or one for `count` without the same data."""
+    """Log an incomplete set: the first one, or `count` sets that lack the same data."""
     if count is not None:
         log.warning("%s%s", line, f" ({count} like it since the last line)" if count else "")
 

@@ -190,12 +190,12 @@ class OnceLock(ActorLock):
                 self[request]
 
     def begin(self, outcome: Write[Outcome], taken: Outcome, newer: Newer) -> None:
-        """Let `update` act on the version that was taken; the lock is over."""
+        """Let `update` act on the claimed version; the lock has been released."""
         self._outcome, self._taken, self._newer = outcome, taken, newer
         self._writing = _Collected(self._session.client.payloads)
 
     def end(self) -> None:
-        """Free the data; the update is over, or the version was not taken."""
+        """Free the data: the update has ended, or the version was not claimed."""
         self._taken = None
         if self._lock is not None:  # else it was never granted
             super()._let_go()

@@ -4,7 +4,7 @@
 
     take        one lock: the version is new → its outcome is "taken", committed
     update      no lock is held; `lock.newer` says when to end
-    outcome     one lock: what came of it, with all that the update wrote
+    outcome     one lock: the result, together with all that the update wrote
 
 Rules that a change must keep:
 
@@ -62,18 +62,18 @@ REFUSALS: Final = (
 OUTCOME_S: Final = 5.0
 """How long a stopped actor still tries to write an outcome."""
 KNOWN_MAX: Final = 1024
-"""Entities whose newest version is known; beyond, those that were deleted are forgotten."""
+"""How many entities' newest versions are remembered; beyond that, deleted ones are dropped."""
 REMAINS: Final = "its outcome will read interrupted, and it is not run again"
-"""What remains of a motion that is cut off."""
+"""The result of a motion that is cut off."""
 
 log = logging.getLogger("enact.actor")
 
 _ended: set[str] = set()
-"""The runs of this process that are over: its session may live on, with the next one."""
+"""The runs of this process that have ended; its session may go on with the next run."""
 
 
 class TakenError(LockTimeoutError):
-    """Another process, whose session lives, acts on an earlier version or on this one."""
+    """Another process with a live session acts on this version or on an earlier one."""
 
 
 class Acted(NamedTuple):
@@ -112,7 +112,7 @@ class OnceInbox(Inbox):
                 self._tell()
 
     def begin(self, entity: Entity, committed_ns: int, newer: Newer) -> None:
-        """Tell `newer` of what comes, or has come, after a version of `entity`."""
+        """Set `newer` as soon as there is a version of `entity` after this one."""
         with self._filled:
             self._running = entity, committed_ns, newer
             self._tell()
@@ -224,7 +224,7 @@ class Once:
         """Close the versions that earlier runs of this actor left as taken.
 
         Returns:
-            Whether nothing is left: no session of such a run lives any more.
+            Whether none is left because all sessions of such runs have ended.
 
         Raises:
             LinkError: A shard does not answer.
@@ -250,7 +250,7 @@ class Once:
         return lock.own(declared)
 
     def _is_open(self, entity: Entity, last: Outcome) -> bool:
-        """Whether a taking stands whose update may have run: all but one of ours that did not."""
+        """Whether a claim stands whose update may have run: not one of ours that never began."""
         if last.state != "taken":
             return False
         return last.run != self._run or self._begun.get(entity) == last
@@ -276,11 +276,11 @@ class Once:
         return next(iter(self._bound.contexts.values())).session
 
     def _close(self, outcome: Write[Outcome], found: Outcome) -> None:
-        """Record a version as interrupted whose taker is gone.
+        """Record a version as interrupted if the process that claimed it has ended.
 
         Raises:
-            TakenError: Its session lives.
-            LinkError: A shard that may know it does not answer.
+            TakenError: Its session is still alive.
+            LinkError: A shard that may know the session does not answer.
         """
         mine = found.run == self._run or found.run in _ended
         if not mine and self._lives(found.session):
@@ -348,7 +348,7 @@ class Once:
     def _write(
         self, outcome: Write[Outcome], taken: Outcome, ended: Outcome, written: list[Any]
     ) -> bool:
-        """Write an outcome and what came with it, trying again until it stands; say if it does."""
+        """Write an outcome with its data, trying again until it stands; return whether it does."""
         requests = dict.fromkeys([outcome, *(request for request, _, _ in written)])
         refused, give_up_s = 0, float("inf")
         while True:

@@ -1,17 +1,16 @@
-"""What a running actor reports of itself: counters, rates, lock waits, its last error.
+"""The report of a running actor: counters, rates, lock waits, its last error.
 
 `ActorStatistics` is a snapshot; `ActorRecord` collects (PURE: time arrives as an argument);
 `encode_reports` and `decode_reports` carry the snapshots of all actors of one process through
 the session's keep-alive to `enact actor ls`.
 
-Nothing here grows: rates come from the newest `STAMPS_MAX` updates, lock waits from the newest
-`WAITS_MAX`, in memory that is taken when the actor starts.
+Memory is fixed when the actor starts: rates come from the newest `STAMPS_MAX` updates, lock waits
+from the newest `WAITS_MAX`.
 
-Repeated events in an actor's log: the first is logged at once, the others as a count.
-
-PURE, as `actor.triggers`: time arrives as an argument.  A dead camera leaves every set incomplete,
-and a broken update fails at each trigger; logged one by one, such events hide everything else.  No
-event is lost: the logger writes the counts of `left` when it ends.
+`Repeated` (PURE, too) keeps an actor's log readable.  A dead camera leaves every set incomplete,
+and a broken update fails at each trigger; logged one by one, such events would hide everything
+else.  So the first is logged at once and the others as a count.  No event is lost: the remaining
+counts are logged at the end.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ if TYPE_CHECKING:
 
 PAUSE_NS_MIN: Final = 5_000_000_000
 PAUSE_NS_MAX: Final = 300_000_000_000
-"""Between two lines of one kind; doubles while there is something to count."""
+"""Pause between two lines of one kind; doubles while such events keep coming."""
 KINDS_MAX: Final = 64
 """Kinds that are counted separately at one time."""
 
@@ -66,7 +65,7 @@ class Repeated:
         """Return the count to report: 0 for the first, None for not now.
 
         Args:
-            kind: What is counted together; of very many kinds the later ones are.
+            kind: Counted together; beyond `KINDS_MAX` kinds, all others are, too.
             text: What happened, for `left`.
             now_ns: When.
         """
@@ -102,7 +101,7 @@ class Repeated:
 
 
 def kind_of(error: BaseException) -> Hashable:
-    """Return what errors that say the same have in common: class, text but for numbers, place."""
+    """Return what equal errors have in common: class, text without numbers, place."""
     places = [(frame.f_code, line) for frame, line in traceback.walk_tb(error.__traceback__)]
     return type(error), _DIGITS.sub("0", str(error)), tuple(places)
 
@@ -136,7 +135,7 @@ class ActorStatistics:
         refused: Attempts that ended outside the actor's code: lock not granted in time, lease
             lost, shard away, viewed datum changed.  Each is tried again later.
         unknown: Commits that were never answered and may stand (`CommitUnknownError`).
-        missed: Ticks of a source that never ran, or ran in vain.
+        missed: Ticks of a source that never ran, or whose update was refused.
         last_error: Newest error as "Class: text", or the empty string.
         rate_hz: Updates per second, over the last 5 s.
         last_update_s: How long the newest update took, without the wait for its lock.
@@ -146,8 +145,8 @@ class ActorStatistics:
         incomplete: Sets of data with one capture stamp (`Together`) that never ran, because some
             of them never came, or left retention before.
         last_incomplete: The newest of these: its stamp and what was missing.
-        late: Data whose set was over when they came.
-        unstamped: Data that could be in no set, because their writer gave no stamp.
+        late: Data that arrived after their set had been closed.
+        unstamped: Data that fit no set because their writer gave no stamp.
         writes: What it declares to write, as ``world:entities/aspect``; at most `WRITES_MAX`.
         unstamped_from: Which data these are.
         partial: Sets that ran without some of their data, as `Together(…, least=…)` allows.
@@ -157,8 +156,8 @@ class ActorStatistics:
         last_interrupted: The newest of these.
         lock_lost: Whether that update has lost its lock, so that it can commit nothing.
         args: The values of its parameters, each as ``name=value``.
-        words_in: The world context in which its process listens for words; empty: it does not.
-        word: The token of the newest word, and its answer to that.
+        words_in: The world context in which its process receives commands; empty: it does not.
+        word: The token of the newest command, and the answer to it.
     """
 
     name: str = ""
@@ -292,7 +291,7 @@ class ActorRecord:
         self._keep(error)
 
     def missed(self, ticks: int) -> None:
-        """Record ticks of a source that did not run, or ran in vain."""
+        """Record ticks of a source that did not run, or whose update was refused."""
         self._counts["missed"] += ticks
 
     def snapshot(self, now_ns: int) -> ActorStatistics:
@@ -349,9 +348,8 @@ def percentile(ascending: list[int], part: float) -> int:
 def encode_reports(reports: list[ActorStatistics]) -> bytes:
     """Return the reports of all actors of one session as msgpack, short enough to be listed.
 
-    Where there are too many for whole reports, what they declare to write is left out, then errors
-    are shortened and blank fields left out, then only names and states stay, and at last the actors
-    that are left are only counted.
+    If whole reports do not fit, declared writes are left out first; then errors are shortened and
+    blank fields dropped; then only names and states stay; finally the remaining actors are counted.
     """
     rows = [{name: getattr(report, name) for name in _NAMES} for report in reports]
     encoded = _packed(rows)
@@ -407,8 +405,7 @@ def decode_reports(report: bytes) -> tuple[ActorStatistics, ...]:
 def read_reports(report: Mapping[str, object]) -> tuple[ActorStatistics, ...]:
     """Return the reports in an unpacked one, such as `ActorInfo.report`; nothing of an empty one.
 
-    Fields that this version does not know are passed over, so that an older `enact actor ls`
-    still shows a newer actor.
+    Unknown fields are ignored, so an older `enact actor ls` still shows a newer actor.
 
     Raises:
         ProtocolError: This is no actor report.

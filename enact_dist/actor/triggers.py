@@ -58,7 +58,7 @@ class PendingTriggers:
         Args:
             source: Index of the trigger request.
             entity: Whose datum.
-            state: What tells this state from any other, such as version and commit stamp.
+            state: What distinguishes this state from any other: version and commit stamp.
 
         Returns:
             Whether this was news.

@@ -56,7 +56,7 @@ def with_environment(config: CellConfig, environment: Mapping[str, str]) -> Cell
 
 
 def without_overrides(environment: Mapping[str, str]) -> dict[str, str]:
-    """Return `environment` for processes that are to do what their `cell.toml` says, no less."""
+    """Return `environment` without overrides, for processes that follow their `cell.toml`."""
     overrides = set(_CELL_NAMES) - {"ENACT_SHARED_FOLDER"}
     return {
         name: text
@@ -140,7 +140,7 @@ def _read(name: str, text: str, field: Field) -> Any:
 def _shard(
     shard: ShardConfig, before: Path | None, now: Path | None, ours: Mapping[str, str]
 ) -> ShardConfig:
-    """Return a shard with its overrides, in a cell whose data folder `now` was `before` another."""
+    """Return a shard with its overrides; the cell's data folder was `before` and is `now`."""
     if shard.folder == (before and before / shard.name):
         shard = dataclasses.replace(shard, folder=now and now / shard.name)
     new = _overridden(shard, lambda key: variable_of(shard.name, key), ours)

@@ -30,11 +30,11 @@ Example::
 `enact_dist/docs/cell.md` explains every key; the dataclasses of `enact_dist.config.types` are what
 the file is read by, and this module adds what concerns several keys.
 
-A cell.toml is a program: the modules that it names run as the user who starts it.  They are looked
-up beside the file first, the working folder comes last.  Relative folders are relative to the file.
-An unknown key, a wrong type or a name that does not exist is a `ConfigError` with file, line and,
-where one is close, a suggestion.  The environment
-overrides the file: see `enact_dist.config.environment`.
+A cell.toml is a program: the modules that it names run as the user who starts it.  Python looks for
+them beside the file first and in the working folder last.  Relative folders are relative to the
+file.  An unknown key, a wrong type or an unknown name is a `ConfigError` with file, line and, if
+there is a similar name, a suggestion.  Environment variables override the file: see
+`enact_dist.config.environment`.
 """
 
 from __future__ import annotations

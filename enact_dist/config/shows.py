@@ -1,4 +1,4 @@
-"""What the data of an aspect look like, and in which frame: said by the cell, or guessed by shape.
+"""How to show the data of an aspect, and in which frame: configured, or guessed by shape.
 
 ::
 
@@ -35,8 +35,8 @@ of an image (``rgb8``, ``rgba8``, ``mono8``, ``16UC1`` and ``32FC1`` by shape an
 frame ``{entity}`` stands for the entity's name and ``{1}``, ``{2}`` … for its segments; without a
 frame the entity's name is used.
 
-Nothing said: an array (H, W, 3) or (H, W, 4) of uint8 is an image, a rigid (4, 4) a pose, a
-dataclass with ``points_m`` a cloud, with ``vertices_m`` and ``triangles`` a mesh, with ``voxels``
+Without configuration, an array (H, W, 3) or (H, W, 4) of uint8 is an image, a rigid (4, 4) a pose,
+a dataclass with ``points_m`` a cloud, with ``vertices_m`` and ``triangles`` a mesh, with ``voxels``
 and ``voxel_m`` voxels, the rest JSON.
 """
 
@@ -85,10 +85,10 @@ class Shows:
         parent: For a transform: the frame in which ``frame`` lies.
         of: Dotted path of the part to look at; the whole datum unless given.
         encoding: Of an image's pixels; by shape and dtype unless given.
-        voxel_m: Edge of a voxel where the datum does not say it; 0: it has to.
-        origin_m: Lowest corner of the grid of voxels where the datum does not say it.
+        voxel_m: Edge of a voxel if the datum has none; 0: the datum must have it.
+        origin_m: Lowest corner of the grid of voxels if the datum has none.
         joints: Names of joints, in order.
-        inverse: A transform says where the parent is in the frame.
+        inverse: A transform gives the parent in the frame, not the frame in the parent.
 
     Raises:
         ConfigError: A kind or encoding is unknown, a pattern or frame is written wrongly.
@@ -125,7 +125,7 @@ class Shows:
         return _frame(self.frame, entity) or entity
 
     def parent_of(self, entity: str) -> str:
-        """Return the frame in which an entity's frame lies; "" if none is said for it."""
+        """Return the frame in which an entity's frame lies; "" if none is configured."""
         return _frame(self.parent, entity)
 
 
@@ -134,7 +134,7 @@ def _check_frames(frames: Frames) -> None:
         try:
             Entities(pattern)
         except ValueError as error:
-            raise ConfigError(f"frames are said per pattern of entities: {error}") from None
+            raise ConfigError(f"a table of frames has patterns as keys: {error}") from None
         if not isinstance(text, str) or set("{}") & set(_PLACE.sub("", text)):
             raise ConfigError(f"{text!r} names no frame; it may hold {{entity}}, {{1}}, {{2}} …")
 

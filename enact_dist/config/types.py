@@ -160,10 +160,9 @@ class AspectConfig:
 
     Attributes:
         name: Name of the aspect.
-        durability: What its commits survive; wins over the actors' own word.  None leaves it to
-            them.
-        retention: How much of each datum's history stays; None leaves it to the actors.
-        compare: What a command line compares its data by, ``package.module:NAME``, or nothing.
+        durability: What its commits survive, whatever the actors declare; None: as they declare.
+        retention: How much of each datum's history stays; None: as the actors declare.
+        compare: Comparator for `enact world diff`, ``package.module:NAME``, or nothing.
         shows: What a recording shows its data as.
     """
 

@@ -321,7 +321,7 @@ def test_requests_are_bound_once_per_entity_and_not_kept_without_end(cell, monke
     bound = BoundActor(Reconstruction(), cell)
 
     def requests(entity):
-        return list(bound.lock(entity)._bound.values())
+        return list(bound.lock(entity)._declared.values())
 
     first, other = requests(A), requests(B)
     assert all(one is again for one, again in zip(first, requests(A), strict=True))

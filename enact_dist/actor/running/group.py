@@ -5,7 +5,7 @@ may share one: `process = "camera-3"` in the table of each in `cell.toml`.  What
 interpreter, its environment, and the memory of what they import.  Each has its own
 
   * session: its locks, its lease, its report, its name in `enact actor ls` and `enact why`.  An
-    actor whose lease is lost, or that ends, takes no lock of another with it;
+    actor whose lease is lost, or that ends, costs no other actor a lock;
   * end: an actor that fails, is done or is restarted (`enact actor restart`) leaves the others
     running.  It is restarted as `enact up` restarts a process: after a growing pause, but not
     once it is done or cannot run as configured;
@@ -77,72 +77,18 @@ class StopWithPulse(threading.Event):
                 return super().is_set()
 
 
-class ActorDrain:
-    """The end of an actor: its current update may finish and commit within `drain_s`.
-
-    If the update does not return by then, or at a second signal, the drain logs what it was doing
-    and ends the process; its lock ends with it.
-
-    Args:
-        name: Name of the actor.
-        doing: What the actor does.
-        drain_s: How long it may still take.
-        leave: Ends the process with a status, without waiting for any thread.
-    """
-
-    def __init__(
-        self, name: str, doing: Doing, drain_s: float, leave: Callable[[int], object] = os._exit
-    ) -> None:
-        self._name, self._doing, self._drain_s, self._leave = name, doing, drain_s, leave
-        self._over = threading.Event()
-
-    def begin(self, signal: str) -> None:
-        """Begin the drain at the first signal."""
-        if self._doing.call is not None:
-            log.info(
-                "%s received: actor %s finishes its current call and ends, within %g s; a second"
-                " signal ends it at once",
-                signal, self._name, self._drain_s,
-            )  # fmt: skip
-        why = f"did not end within {self._drain_s:g} s of {signal}"
-        threading.Thread(target=self._wait, args=(why,), name="drain", daemon=True).start()
-
-    def hurry(self, _signal: str) -> None:
-        """End the process at once at the second request to end."""
-        self._cut_off("received a second signal")
-
-    def over(self) -> None:
-        """Note that the actor has ended by itself."""
-        self._over.set()
-
-    def _wait(self, why: str) -> None:
-        if not self._over.wait(self._drain_s):
-            self._cut_off(why)
-
-    def _cut_off(self, why: str) -> None:
-        if self._over.is_set():
-            return
-        say = threading.Thread(target=self._say, args=(why,), daemon=True)
-        say.start()
-        say.join(SAY_S)
-        self._over.set()  # set once, if leaving waits for other actors of the process
-        self._leave(CUT_OFF)
-
-    def _say(self, why: str) -> None:
-        log.critical("cut off: actor %s %s: %s", self._name, why, self._doing.cut_off())
-        sys.stdout.flush()
-        sys.stderr.flush()
-
-
 class Life:
-    """One life of an actor, and how it is asked to end; from any thread.
+    """One life of an actor, and its end: its current update may finish and commit within `drain_s`.
+
+    If the update does not return by then, or at a second request, the life logs what the actor was
+    doing and ends the process; the actor's lock ends with it.  Any thread may call it.
 
     Args:
         name: Name of the actor.
         drain_s: How long its update may still take once it is asked to end, seconds.
         alive: Called by the actor's thread each time it looks whether to stop; must not block.
         ready: Called when the actor serves.
-        leave: Called with an exit status where the actor does not end in time.
+        leave: Called with an exit status where the actor does not end in time; waits for no thread.
 
     Attributes:
         stop: Set once the actor is asked to end.
@@ -162,34 +108,60 @@ class Life:
         self.ready = ready
         self._name, self._drain_s, self._leave = name, drain_s, leave
         self._mutex = threading.Lock()
-        self._drain: ActorDrain | None = None
+        self._doing: Doing | None = None
         self._why = ""
+        self._over = threading.Event()
 
     def begin(self, doing: Doing) -> None:
-        """Note that the actor is about to run; `doing` tells what it does."""
-        drain = ActorDrain(self._name, doing, self._drain_s, self._leave)
+        """Note that the actor is about to run; `doing` shows what it is doing."""
         with self._mutex:
-            self._drain, why = drain, self._why
+            self._doing, why = doing, self._why
         if why:
-            drain.begin(why)
+            self._drain(doing, why)
 
     def end(self, why: str) -> None:
         """Ask the actor to end after its update, within its drain."""
         self.stop.set()
         with self._mutex:
-            self._why, drain = why, self._drain
-        if drain is not None:
-            drain.begin(why)
+            self._why, doing = why, self._doing
+        if doing is not None:
+            self._drain(doing, why)
 
-    def hurry(self, why: str) -> None:
+    def hurry(self, _why: str) -> None:
         """Cut the actor off now."""
-        if self._drain is not None:
-            self._drain.hurry(why)
+        if self._doing is not None:
+            self._cut_off(self._doing, "received a second signal")
 
     def over(self) -> None:
         """Note that the actor has ended by itself."""
-        if self._drain is not None:
-            self._drain.over()
+        self._over.set()
+
+    def _drain(self, doing: Doing, why: str) -> None:
+        if doing.call is not None:
+            log.info(
+                "%s received: actor %s finishes its current call and ends, within %g s; a second"
+                " signal ends it at once",
+                why, self._name, self._drain_s,
+            )  # fmt: skip
+        threading.Thread(target=self._wait, args=(doing, why), name="drain", daemon=True).start()
+
+    def _wait(self, doing: Doing, why: str) -> None:
+        if not self._over.wait(self._drain_s):
+            self._cut_off(doing, f"did not end within {self._drain_s:g} s of {why}")
+
+    def _cut_off(self, doing: Doing, why: str) -> None:
+        if self._over.is_set():
+            return
+        say = threading.Thread(target=self._say, args=(doing, why), daemon=True)
+        say.start()
+        say.join(SAY_S)
+        self._over.set()  # set once, if leaving waits for other actors of the process
+        self._leave(CUT_OFF)
+
+    def _say(self, doing: Doing, why: str) -> None:
+        log.critical("cut off: actor %s %s: %s", self._name, why, doing.cut_off())
+        sys.stdout.flush()
+        sys.stderr.flush()
 
 
 class ActorGroup:
@@ -301,7 +273,7 @@ class ActorGroup:
         self._heard_of(name)
 
     def _again(self, name: str, status: int, pauses: RestartPauses) -> bool:
-        """Tell of the end of an actor; wait and return True where it is to be started again."""
+        """Log the end of an actor; if it is to be restarted, wait and return True."""
         if status == DONE:
             log.info("actor %s is done; it is not started again", name)
             return False
@@ -321,7 +293,7 @@ class ActorGroup:
         self._heard_of(name)
 
     def _heard_of(self, name: str) -> None:
-        """Tell once that the process is ready: each actor has been, or has ended."""
+        """Report the process as ready once each actor has been ready or has ended."""
         with self._changed:
             last = self._unready == {name}
             self._unready.discard(name)
@@ -341,7 +313,7 @@ class ActorGroup:
         self._leave_if_cut()
 
     def _leave_if_cut(self) -> None:
-        """End the process once nothing but what was cut off is left in it."""
+        """End the process once only actors that were cut off are left in it."""
         with self._changed:
             leaves = bool(self._kept) and self._kept <= self._cut
         if leaves:

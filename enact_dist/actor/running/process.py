@@ -1,8 +1,7 @@
-"""Actors beside each other: as threads of one process, or each as a process of its own.
+"""Several actors at once: as threads of one process, or each as a process of its own.
 
-Threads share one cell (the paper's own mode, and the only one on `local()`).  Processes are
-started afresh, never forked: a forked child would share its parent's session and threads it does
-not have.
+Threads share one cell (the mode of the paper, and the only one on `local()`).  Processes are
+spawned, never forked: a forked child would share its parent's session without the parent's threads.
 """
 
 from __future__ import annotations

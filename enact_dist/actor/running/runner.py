@@ -15,11 +15,12 @@ any other exception                       counted, logged (one like before as a 
                                           error; run again when the entity changes
 ========================================  =====================================================
 
-Before that the shards of its data have to accept its requests: one that is away is waited for, and
-a type other than the registered one ends the run.
+Before the first update, the shards of the actor's data have to accept its requests.  The run waits
+for a shard that is away, and ends if a shard knows an aspect with another type.
 
-A source takes its next tick instead of trying again; an actor that runs once tries again after
-the first kind, and after the second it is over.  `KeyboardInterrupt` and the like end the run.
+After a refusal, a source waits for its next tick instead of trying again.  An actor that runs once
+tries again after a refusal and ends after any other error.  `KeyboardInterrupt` and the like end
+the run.
 """
 
 from __future__ import annotations
@@ -63,17 +64,17 @@ if TYPE_CHECKING:
     from enact_dist.world.cell import Cell
 
 OnError = Callable[["Entity | None", Exception], None]
-"""Called with each error of a run and the triggering entity, in the actor's thread."""
+"""Called with the triggering entity and each error of a run, in the actor's thread."""
 
 STOP_LOOK_S: Final = 0.1
-"""An idle actor looks at `stop` this often; an `Event` and a `Condition` cannot be awaited both."""
+"""How often an idle actor checks `stop`: no call waits for an `Event` and a `Condition` at once."""
 
 REPORT_EVERY_NS: Final = 1_000_000_000
 SWEEP_NS: Final = 2_000_000_000
-"""How often an actor with `once` looks for what a process before it has left, until it is gone."""
+"""How often an actor with `once` looks for versions that an earlier process left as taken."""
 LOOK_OUT_S: Final = 1.0
 NOTHING: Final = "nothing of it was written"
-"""What remains of an update that is cut off: its lock ends with its process."""
+"""The result of an update that is cut off: its lock ends with its process."""
 
 log = logging.getLogger("enact.actor")
 
@@ -235,7 +236,7 @@ class ActorRun:
         return self.statistics()
 
     def _look_out(self) -> None:
-        """Report for an update that takes long, as it cannot report itself."""
+        """Report on behalf of an update that takes long."""
         while not self._ended.wait(LOOK_OUT_S):
             call = self.doing.call
             if call is not None and monotonic_ns() - call.since_ns >= REPORT_EVERY_NS:
@@ -375,7 +376,7 @@ class ActorRun:
                 entity, wait_s=self._wait_s, granted=lambda: granted_ns.append(monotonic_ns())
             )
         except TakenError as error:
-            return error  # told when it was found
+            return error  # was logged when it was found
         except REFUSALS as error:
             if not (isinstance(error, LockTimeoutError) and self._stop.is_set()):
                 self._refused(entity, error)
@@ -403,7 +404,7 @@ class ActorRun:
         self._tell(entity, error)
 
     def _warn_of_repetition(self, entity: Entity | None) -> None:
-        """Say once that an update that has lost its lock runs again, and how it would not."""
+        """Warn once that an update runs again after it lost its lock, and how to prevent that."""
         if entity not in self._lost or self._every_s is not None:
             return
         self._lost.discard(entity)
@@ -418,7 +419,7 @@ class ActorRun:
             )  # fmt: skip
 
     def _tell(self, entity: Entity | None, error: Exception) -> None:
-        """Log an error of an update: its traceback, or a count where it is one like before."""
+        """Log an error of an update: with its traceback, or as a count of equal errors."""
         text = f"{type(error).__name__}: {error}"
         count = self._failures.tell(kind_of(error), text, monotonic_ns())
         if count == 0:
@@ -430,7 +431,7 @@ class ActorRun:
             )  # fmt: skip
 
     def _tell_left(self) -> None:
-        """Log what was only counted so far."""
+        """Log the errors that have only been counted so far."""
         for count, newest in self._failures.left():
             log.error("%s: update failed as before %d more times: %s", self.name, count, newest)
         if self._sets is not None:

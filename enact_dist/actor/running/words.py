@@ -1,11 +1,11 @@
 """Commands to a running actor: change its attributes, or restart it.
 
-Commands stand in one volatile datum of the entity `actor` in one of the actor's world contexts, by
-the session of the actor's process.  One slot serves all: a shard never forgets a slot, so one for
-each session would stay after the session.  The actor's process watches the slot, takes its command
-out of the datum, executes it between two updates, and answers in its report.  A writer drops the
-commands of sessions that are gone.  Changed values last until the process ends;
-`cell.toml` holds the values that an actor starts with.
+Commands are kept in one volatile datum of the entity `actor`, in one of the actor's world contexts,
+by the session of the actor's process.  One slot serves all sessions, because a shard never deletes
+a slot.  The actor's process watches the slot, removes its command from the datum, executes it
+between two updates, and answers in its report.  Each writer drops the commands of sessions that
+have ended.  Changed values last until the process ends; an actor starts with the values of
+`cell.toml`.
 """
 
 from __future__ import annotations
