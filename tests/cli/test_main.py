@@ -3,10 +3,14 @@
 import argparse
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from enact_dist.cli.main import build_parser, main
+from enact_dist.cli.verbs import NOUNS, function_of, table_of
+
+PAGES = Path(__file__).parents[2] / "enact_dist" / "docs"
 
 
 def walk_verbs(parser, words=()):
@@ -65,7 +69,8 @@ def test_help_of_up_names_the_variable_that_it_goes_by(capsys, enact, monkeypatc
     [
         (w, line)
         for w, p in walk_verbs(build_parser())
-        for line in (p.epilog or "").splitlines()[1:]
+        for line in (p.epilog or "").splitlines()
+        if line.startswith("  ")
     ],
 )
 def test_examples_of_the_help_can_be_parsed(words, example):
@@ -76,6 +81,15 @@ def test_examples_of_the_help_can_be_parsed(words, example):
     line = line[: line.index("--")] if "--" in line else line
 
     assert isinstance(build_parser().parse_args(line), argparse.Namespace)
+
+
+@pytest.mark.parametrize("noun", NOUNS)
+def test_every_verb_of_a_table_names_its_function_and_a_page(noun):
+    """A table names both by words, which no type checker follows."""
+    assert (PAGES / f"{NOUNS[noun].page}.md").exists()
+    for verb in table_of(noun):
+        assert callable(function_of(noun, verb))
+        assert (PAGES / f"{verb.page or NOUNS[noun].page}.md").exists()
 
 
 def test_readers_all_have_json():

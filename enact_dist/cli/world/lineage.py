@@ -2,27 +2,19 @@
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.cli.text.output import print_json, print_tree, shown_s
-from enact_dist.cli.verbs import (
-    DONE,
-    NOUNS,
-    add_reader,
-    add_verb,
-    add_world,
-    open_cell,
-    slot_version,
-    whole,
-)
+from enact_dist.cli.arguments import READER, WORLD, counted, slot_version
+from enact_dist.cli.target import open_cell
+from enact_dist.cli.text.output import print_tree, shown_s
+from enact_dist.cli.verbs import NOUNS, Option, Output, Verb, flag, option
 from enact_dist.world.lineage import FORGOTTEN, NULL, UNKNOWN
 
 if TYPE_CHECKING:
+    import argparse
     from collections.abc import Iterable, Sequence
 
-    from enact_dist.cli.verbs import Verb
     from enact_dist.world.lineage import CauseTree, EffectTree, Made
 
     Tree = CauseTree | EffectTree
@@ -40,66 +32,54 @@ _KIND: Final = {
 }
 
 
-def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
-    """Add the two verbs, which have no noun."""
-    why = add_verb(
-        nouns, "why", NOUNS["why"].summary,
-        run=show_causes,
-        example="enact why online system/deviation\n"
+def _options(what: str, *more: Option) -> tuple[Option, ...]:
+    return (
+        WORLD,
+        option("slot", "ENTITY/ASPECT[@VERSION]",
+               "which datum; the newest version unless one is named", type=slot_version),
+        counted("--depth", f"steps (default: {DEPTH})", DEPTH),
+        flag("--all", f"show {what} that are alike one by one"),
+        *READER,
+        *more,
+    )  # fmt: skip
+
+
+_KEEP: Final = option(
+    "--keep", "LABEL", "keep the versions of the tree until the label is released"
+)
+VERBS: Final = (
+    Verb(
+        "why", NOUNS["why"].summary, "show_causes",
+        "enact why online system/deviation\n"
         "enact why online system/deviation@12 --depth 5 --keep incident-7",
-    )  # fmt: skip
-    _add_arguments(why, "causes")
-    why.add_argument(
-        "--keep", metavar="LABEL", help="keep the versions of the tree until the label is released"
-    )
-    impact = add_verb(
-        nouns, "impact", NOUNS["impact"].summary,
-        run=show_effects,
-        example="enact impact training view/milk_carton/0/cloud",
-    )  # fmt: skip
-    _add_arguments(impact, "effects")
+        _options("causes", _KEEP),
+    ),
+    Verb(
+        "impact", NOUNS["impact"].summary, "show_effects",
+        "enact impact training view/milk_carton/0/cloud",
+        _options("effects"),
+    ),
+)  # fmt: skip
 
 
-def _add_arguments(verb: Verb, what: str) -> None:
-    add_world(verb)
-    verb.add_argument(
-        "slot",
-        metavar="ENTITY/ASPECT[@VERSION]",
-        type=slot_version,
-        help="which datum; the newest version unless one is named",
-    )
-    verb.add_argument(
-        "--depth", type=whole, default=DEPTH, metavar="N", help=f"steps (default: {DEPTH})"
-    )
-    verb.add_argument("--all", action="store_true", help=f"show {what} that are alike one by one")
-    add_reader(verb)
+def show_causes(options: argparse.Namespace) -> Output:
+    """Draw the tree of causes of one version."""
+    with open_cell(options, observer=not options.keep) as cell:
+        tree = cell.why(options.world, *options.slot, depth=options.depth)
+        if options.keep:
+            cell.pin(options.keep, (one for one in tree.walk() if one.known))
+    return _answer(tree, options)
 
 
-def show_causes(arguments: argparse.Namespace) -> int:
-    """Print the tree of causes of one version."""
-    entity, aspect, version = arguments.slot
-    with open_cell(arguments, observer=not arguments.keep) as cell:
-        tree = cell.why(arguments.world, entity, aspect, version, depth=arguments.depth)
-        if arguments.keep:
-            cell.pin(arguments.keep, (one for one in tree.walk() if one.known))
-        _print(tree, arguments)
-    return DONE
+def show_effects(options: argparse.Namespace) -> Output:
+    """Draw the tree of effects of one version."""
+    with open_cell(options) as cell:
+        return _answer(cell.impact(options.world, *options.slot, depth=options.depth), options)
 
 
-def show_effects(arguments: argparse.Namespace) -> int:
-    """Print the tree of effects of one version."""
-    entity, aspect, version = arguments.slot
-    with open_cell(arguments) as cell:
-        tree = cell.impact(arguments.world, entity, aspect, version, depth=arguments.depth)
-        _print(tree, arguments)
-    return DONE
-
-
-def _print(tree: Tree, arguments: argparse.Namespace) -> None:
-    if arguments.json:
-        print_json(facts_of(tree))
-    else:
-        print_tree(drawn(tree, alike_min=0 if arguments.all else ALIKE_MIN))
+def _answer(tree: Tree, options: argparse.Namespace) -> Output:
+    alike_min = 0 if options.all else ALIKE_MIN
+    return Output(lambda: facts_of(tree), lambda: print_tree(drawn(tree, alike_min=alike_min)))
 
 
 def facts_of(one: Tree) -> dict[str, object]:
