@@ -126,10 +126,10 @@ VERBS: Final = (
         "list locks that were ended by hand, and alarms: commits that stand only in part since",
         "list_audit",
         "enact lock audit\n"
-        "enact lock audit --settle 'bench/contacts written again from left' --shard right",
+        "enact lock audit --acknowledge 'bench/contacts written again from left' --shard right",
         (
-            option("--settle", "TEXT", "say how all alarms so far were seen to"),
-            option("--shard", "NAME", "whose alarms; needed with --settle"),
+            option("--acknowledge", "TEXT", "record what was done about all alarms so far"),
+            option("--shard", "NAME", "whose alarms; needed with --acknowledge"),
             *READER,
         ),
         columns=("when", "shard", "what", "by", "details"),
@@ -306,12 +306,12 @@ def resolve_lock(cell: Cell, options: argparse.Namespace) -> Output:
 
 
 def list_audit(options: argparse.Namespace) -> Output:
-    """List what operators did and what came of it; with `--settle`, first add to it."""
-    if (options.settle is None) != (options.shard is None):
-        raise ConfigError("--settle TEXT and --shard NAME go together")
+    """List what operators did and what came of it; with `--acknowledge`, first add to it."""
+    if (options.acknowledge is None) != (options.shard is None):
+        raise ConfigError("--acknowledge TEXT and --shard NAME go together")
     with open_cell(options) as cell:
-        if options.settle is not None:
-            cell.settle_alarms(shard=options.shard, how=options.settle)
+        if options.acknowledge is not None:
+            cell.settle_alarms(shard=options.shard, how=options.acknowledge)
         shards, status = in_reach(cell)
         entries = cell.audit(shards)
     rows = [

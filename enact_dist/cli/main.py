@@ -20,7 +20,16 @@ import re
 import sys
 from typing import TYPE_CHECKING, Any, Final
 
-from enact_dist.cli.verbs import DONE, NOUNS, USAGE, add_noun, exit_status, run_verb, told
+from enact_dist.cli.verbs import (
+    DONE,
+    NOUNS,
+    USAGE,
+    add_noun,
+    exit_status,
+    renamed,
+    run_verb,
+    told,
+)
 from enact_dist.errors import EnactError
 
 if TYPE_CHECKING:
@@ -118,6 +127,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _main(words: list[str]) -> int:
     words, command = _split_command(words)
     noun = next((word for word in words if not word.startswith("-")), "")
+    words, remarks = renamed(noun, words)
+    for remark in remarks:
+        print(f"enact: {remark}", file=sys.stderr)
     parser = build_parser(noun) if noun in NOUNS else _overview()
     arguments = parser.parse_args(words)
     arguments.command = command

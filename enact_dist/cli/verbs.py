@@ -85,6 +85,28 @@ NOUNS: Final = {
 """All commands, in the order in which `enact --help` shows them."""
 
 
+FORMER: Final = {
+    "world": {"keep": "pin", "kept": "pinned", "let-go": "unpin"},
+    "why": {"--keep": "--pin"},
+    "lock": {"--settle": "--acknowledge"},
+}
+"""Names of the release before, by noun.  They work for one release more, but no help shows them."""
+
+
+def renamed(noun: str, words: list[str]) -> tuple[list[str], list[str]]:
+    """Return a command line with the names of this release, and a remark on each former one."""
+    names, remarks = FORMER.get(noun, {}), []
+    plain = [at for at, word in enumerate(words) if not word.startswith("-")][:2]
+    new = list(words)
+    for at, word in enumerate(words):
+        name, equals, value = word.partition("=")
+        if name in names and (name.startswith("--") or at == plain[-1]):
+            new[at] = names[name] + equals + value
+            old, now = (f"enact {noun} {one}" for one in (name, names[name]))
+            remarks.append(f"{old} is now called {now}; the next release has the new name alone")
+    return new, remarks
+
+
 # ---------------------------------------------------------------- tables
 
 

@@ -280,7 +280,7 @@ def _shard(shard: ShardInfo) -> Iterator[Finding]:
             f"commits on {shard.name}",
             f"{alarms} locks that were aborted by hand had been committed elsewhere: they stand"
             " only in part",
-            "read enact lock audit, mend the data, then enact lock audit --settle TEXT"
+            "read enact lock audit, mend the data, then enact lock audit --acknowledge TEXT"
             f" --shard {shard.name}",
         )
 

@@ -44,15 +44,13 @@ def _options(what: str, *more: Option) -> tuple[Option, ...]:
     )  # fmt: skip
 
 
-_KEEP: Final = option(
-    "--keep", "LABEL", "keep the versions of the tree until the label is released"
-)
+_PIN: Final = option("--pin", "LABEL", "pin the versions of the tree until `enact world unpin`")
 VERBS: Final = (
     Verb(
         "why", NOUNS["why"].summary, "show_causes",
         "enact why online system/deviation\n"
-        "enact why online system/deviation@12 --depth 5 --keep incident-7",
-        _options("causes", _KEEP),
+        "enact why online system/deviation@12 --depth 5 --pin incident-7",
+        _options("causes", _PIN),
     ),
     Verb(
         "impact", NOUNS["impact"].summary, "show_effects",
@@ -64,10 +62,10 @@ VERBS: Final = (
 
 def show_causes(options: argparse.Namespace) -> Output:
     """Draw the tree of causes of one version."""
-    with open_cell(options, observer=not options.keep) as cell:
+    with open_cell(options, observer=not options.pin) as cell:
         tree = cell.why(options.world, *options.slot, depth=options.depth)
-        if options.keep:
-            cell.pin(options.keep, (one for one in tree.walk() if one.known))
+        if options.pin:
+            cell.pin(options.pin, (one for one in tree.walk() if one.known))
     return _answer(tree, options)
 
 

@@ -1,4 +1,4 @@
-"""`enact world history|at|fork|drop|keep|kept|let-go`: world contexts in time."""
+"""`enact world history|at|fork|drop|pin|pinned|unpin`: world contexts in time."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _row(version: Version[Any]) -> tuple[str, ...]:
     stamp_ns = version.position.stamp_ns
     size = shown_bytes(version.size_bytes) if version.size_bytes else ""
     notes = [f"null: {version.null_reason}"] if version.null_reason else []
-    notes += [f"kept as {', '.join(version.pinned)}"] if version.pinned else []
+    notes += [f"pinned as {', '.join(version.pinned)}"] if version.pinned else []
     return (
         f"v{version.version}",
         moment_name(stamp_ns),
@@ -140,11 +140,11 @@ def drop_world(cell: Cell, options: argparse.Namespace) -> Output:
     return Output(facts, f"{options.world} is dropped, with {slots} slots")
 
 
-# ---------------------------------------------------------------- keep, kept, let-go
+# ---------------------------------------------------------------- pin, pinned, unpin
 
 
-def keep_versions(cell: Cell, options: argparse.Namespace) -> Output:
-    """Keep versions of slots of one world context under a label.
+def pin_versions(cell: Cell, options: argparse.Namespace) -> Output:
+    """Pin versions of slots of one world context under a label.
 
     Raises:
         ForgottenError: A version is not known (any more).
@@ -152,7 +152,7 @@ def keep_versions(cell: Cell, options: argparse.Namespace) -> Output:
     world = cell.world(options.world)
     versions = [_version(world, *named) for named in options.slots]
     cell.pin(options.label, versions)
-    lines = (f"{one.slot} v{one.version} is kept as {options.label}" for one in versions)
+    lines = (f"{one.slot} v{one.version} is pinned as {options.label}" for one in versions)
     return Output([_facts(version) for version in versions], "\n".join(lines))
 
 
@@ -169,19 +169,19 @@ def _version(world: WorldContext, entity: str, aspect: str, number: int) -> Vers
     )
 
 
-def list_kept(cell: Cell, _options: argparse.Namespace) -> Output:
-    """List what labels keep."""
-    kept = cell.pinned()
-    rows = [(label, str(one.slot), *_row(one)[:4]) for label in kept for one in kept[label]]
-    return Output({label: [*map(_facts, versions)] for label, versions in kept.items()}, rows=rows)
+def list_pinned(cell: Cell, _options: argparse.Namespace) -> Output:
+    """List the pinned versions by label."""
+    pinned = cell.pinned()
+    rows = [(label, str(one.slot), *_row(one)[:4]) for label in pinned for one in pinned[label]]
+    return Output({label: [*map(_facts, pinned[label])] for label in pinned}, rows=rows)
 
 
-def let_go_of(cell: Cell, options: argparse.Namespace) -> Output:
-    """Release the versions of a label; status 1 if it keeps none."""
-    label, kept = options.label, cell.pinned()
-    count = len(kept.get(label, ()))
+def unpin_label(cell: Cell, options: argparse.Namespace) -> Output:
+    """Release the versions of a label; status 1 if it has none."""
+    label, pinned = options.label, cell.pinned()
+    count = len(pinned.get(label, ()))
     cell.unpin(label)
     text = f"{label}: {count} versions released"
     if not count:
-        text = f"nothing is kept as {label}; labels: {', '.join(kept) or 'none'}"
+        text = f"nothing is pinned as {label}; labels: {', '.join(pinned) or 'none'}"
     return Output({"label": label, "versions": count}, text, status=DONE if count else FAILED)
