@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -12,9 +13,18 @@ from enact_dist.errors import ConfigError
 from enact_dist.terms import Entities, Entity, checked_name
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Iterator
 
     from enact_dist.comparing import Tolerance
+
+
+@contextmanager
+def in_words() -> Iterator[None]:
+    """Let `argparse` print the text of a `ValueError`, not the name of the type alone."""
+    try:
+        yield
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def duration(text: str) -> float:
@@ -33,12 +43,10 @@ def seconds(text: str) -> float:
     return value
 
 
+@in_words()
 def one_entity(text: str) -> Entity:
     """Read the name of one entity; an `argparse` type."""
-    try:
-        return Entity(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
+    return Entity(text)
 
 
 def whole(text: str) -> int:
@@ -48,46 +56,37 @@ def whole(text: str) -> int:
     return int(text)
 
 
+@in_words()
 def endpoints(text: str) -> str:
     """Check endpoints, comma separated, or none; an `argparse` type."""
     from enact_dist.config.types import checked_endpoint
 
     for endpoint in text.split(","):
         if endpoint.strip():
-            _checked(checked_endpoint, endpoint.strip())
+            checked_endpoint(endpoint.strip())
     return text
 
 
+@in_words()
 def address(text: str) -> str:
     """Check where metrics are to be served, or nothing; an `argparse` type."""
     from enact_dist.config.types import metrics_address
 
     if text:
-        _checked(metrics_address, text)
+        metrics_address(text)
     return text
 
 
-def _checked(check: Callable[[str], object], text: str) -> None:
-    try:
-        check(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
-
-
+@in_words()
 def entities(text: str) -> str:
     """Read a pattern of entities; an `argparse` type."""
-    try:
-        return str(Entities(text))
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
+    return str(Entities(text))
 
 
+@in_words()
 def world_name(text: str) -> str:
     """Check the name of a world context that is to be made; an `argparse` type."""
-    try:
-        checked_name("world context", text, slashes=False)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
+    checked_name("world context", text, slashes=False)
     return text
 
 
@@ -121,14 +120,12 @@ def slot_parts(text: str) -> tuple[str, str]:
     return entity, aspect
 
 
+@in_words()
 def slot_name(text: str) -> tuple[str, str]:
     """Read ``ENTITY/ASPECT``, two names and no pattern; an `argparse` type."""
     entity, aspect = slot_parts(text)
-    try:
-        checked_name("entity", entity, slashes=True)
-        checked_name("aspect", aspect, slashes=False)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
+    checked_name("entity", entity, slashes=True)
+    checked_name("aspect", aspect, slashes=False)
     return entity, aspect
 
 

@@ -13,6 +13,7 @@ from enact_dist.cli.arguments import (
     CELL,
     READER,
     TIMEOUT,
+    in_words,
     seconds_of,
     slot_parts,
     whole,
@@ -47,6 +48,7 @@ _ACCESSES: Final = {
 }
 
 
+@in_words()
 def held(text: str) -> tuple[str, str, str, str]:
     """Read ``[WORLD:]ENTITY/ASPECT:read|write``; an `argparse` type."""
     found = _HELD.match(text)
@@ -55,11 +57,8 @@ def held(text: str) -> tuple[str, str, str, str]:
             f"{text!r} is not written [WORLD:]ENTITY/ASPECT:read or …:write"
         )
     entity, aspect = slot_parts(found["slot"])
-    try:
-        (Entities if "*" in entity else Entity)(entity)
-        checked_name("aspect", aspect, slashes=False)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
+    (Entities if "*" in entity else Entity)(entity)
+    checked_name("aspect", aspect, slashes=False)
     return found["world"] or "", entity, aspect, found["access"]
 
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import itertools
 import time
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.cli.text.output import print_tree, shown_bytes, shown_s
+from enact_dist.cli.text.output import Branch, print_tree, shown_bytes, shown_s
 from enact_dist.cli.verbs import Output
 from enact_dist.config.table import suggestion
 from enact_dist.errors import EnactError, NullDatumError
@@ -23,21 +22,6 @@ if TYPE_CHECKING:
 
 COMPARED_MAX: Final = 1000
 """Names examined for a similar one: takes a few hundredths of a second."""
-
-
-@dataclass(slots=True)
-class Branch:
-    """One segment of an entity's path: its line, and what lies below."""
-
-    label: str
-    children: dict[str, Branch] = field(default_factory=dict)
-
-    def at(self, segments: list[str]) -> Branch:
-        """Return the branch at a path below this one, growing it where needed."""
-        branch = self
-        for segment in segments:
-            branch = branch.children.setdefault(segment, Branch(f"{segment}/"))
-        return branch
 
 
 def slots_output(title: str, infos: Sequence[SlotInfo], *, at_ns: int | None = None) -> Output:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.cli.arguments import READER, WORLD, counted, slot_version
 from enact_dist.cli.target import open_cell
-from enact_dist.cli.text.output import print_tree, shown_s
+from enact_dist.cli.text.output import Branch, print_tree, shown_s
 from enact_dist.cli.verbs import NOUNS, Option, Output, Verb, flag, option
 from enact_dist.world.lineage import FORGOTTEN, NULL, UNKNOWN
 
@@ -107,19 +106,7 @@ def facts_of(one: Tree) -> dict[str, object]:
 # ---------------------------------------------------------------- lines for people
 
 
-@dataclass(slots=True)
-class Line:
-    """One line of the drawn tree, and those below it."""
-
-    label: str
-    children: dict[str, Line] = field(default_factory=dict)
-
-    def add(self, line: Line) -> None:
-        """Put a line below this one."""
-        self.children[str(len(self.children))] = line
-
-
-def drawn(tree: Tree, *, alike_min: int = ALIKE_MIN) -> Line:
+def drawn(tree: Tree, *, alike_min: int = ALIKE_MIN) -> Branch:
     """Return the lines of a tree.
 
     Args:
@@ -130,8 +117,8 @@ def drawn(tree: Tree, *, alike_min: int = ALIKE_MIN) -> Line:
     return _line_of([tree], alike_min)
 
 
-def _line_of(alike: Sequence[Tree], alike_min: int) -> Line:
-    line = Line(_label_of_one(alike[0]) if len(alike) == 1 else _label_of_many(alike))
+def _line_of(alike: Sequence[Tree], alike_min: int) -> Branch:
+    line = Branch(_label_of_one(alike[0]) if len(alike) == 1 else _label_of_many(alike))
     groups: dict[tuple[object, ...], list[Tree]] = {}
     for child in _once(child for one in alike for child in one.children):
         groups.setdefault(_likeness(child), []).append(child)
@@ -143,13 +130,13 @@ def _line_of(alike: Sequence[Tree], alike_min: int) -> Line:
             for one in group:
                 line.add(_line_of([one], alike_min))
     if repeated:
-        line.add(Line(f"and, shown elsewhere: {', '.join(_names_of(repeated, alike_min))}"))
+        line.add(Branch(f"and, shown elsewhere: {', '.join(_names_of(repeated, alike_min))}"))
     left_out = sum(one.left_out for one in alike)
     if left_out:
-        line.add(Line(f"… and {left_out} further data, more than are named"))
+        line.add(Branch(f"… and {left_out} further data, more than are named"))
     unfollowed = sum(one.unfollowed for one in alike)
     if unfollowed:
-        line.add(Line(f"… {unfollowed} more steps, with a larger --depth"))
+        line.add(Branch(f"… {unfollowed} more steps, with a larger --depth"))
     return line
 
 
