@@ -172,7 +172,12 @@ READER: Final = (CELL, JSON, TIMEOUT)
 """Of verbs that print what they find."""
 WORLD: Final = option("world", "WORLD", "name of the world context")
 PATTERN: Final = option(
-    "pattern", "PATTERN", "of entities (default: all)", type=entities, nargs="?", default="**"
+    "pattern",
+    "PATTERN",
+    "pattern of entities (default: all)",
+    type=entities,
+    nargs="?",
+    default="**",
 )
 ENTITIES: Final = option(
     "--entities", "PATTERN", "only these entities", type=entities, default="**"

@@ -66,8 +66,8 @@ def bench_name(text: str) -> str:
 
 
 _PACKING: Final = OptionGroup("palletizing", (
-    counted("--packages", "how many (default: 36, 12 a tray)", 36),
-    counted("--seed", "of all that is random (default: 1)", 1),
+    counted("--packages", "number of packages (default: 36, 12 a tray)", 36),
+    counted("--seed", "seed of all random values (default: 1)", 1),
     counted("--processes", "trays side by side (default: 2)", 2),
     option("--spread", "SIGMA_MM,FRICTION",
            "how far the belt's sensor is off, and friction (default: 2, 6 and 12 mm with 0.2, 0.4"

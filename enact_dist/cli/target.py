@@ -32,7 +32,7 @@ def cell_target(options: argparse.Namespace) -> str:
     if not Path(CELL_DEFAULT).is_file():
         raise ConfigError(
             f"no cell: there is no {CELL_DEFAULT} in {Path.cwd()}; name one with --cell FILE or"
-            f" --cell tcp/host:7447, or set {CELL_VARIABLE}"
+            f" --cell tcp/host:7447, or set {CELL_VARIABLE} (docs/cell.md explains the file)"
         )
     return CELL_DEFAULT
 

@@ -47,7 +47,7 @@ class Noun(NamedTuple):
 NOUNS: Final = {
     "up": Noun("up", "run every shard and actor of a cell on this machine until Ctrl-C", "cell"),
     "shard": Noun("shard", "run, list, back up and rebalance shards", "operations"),
-    "actor": Noun("actor", "run, list, check and change actors", "guide"),
+    "actor": Noun("actor", "run, list, check and change actors", "own_actors"),
     "world": Noun("world", "read, write, fork and compare world contexts", "guide"),
     "why": Noun(
         "world.lineage", "show where a datum comes from: who wrote it, and from which data", "time"

@@ -17,12 +17,12 @@ def minutes(text: str) -> float:
 
 
 _SIMULATION: Final = (
-    counted("--seeds", "how many (default: 200)"),
-    option("--first", "SEED", "first of them (default: never the same twice)", type=int),
+    counted("--seeds", "number of seeds (default: 200)"),
+    option("--first", "SEED", "first of the seeds (default: never the same twice)", type=int),
     counted("--jobs", "processes (default: one per processor)"),
     OneOf((
-        seconds_of("--seconds", "how long to go on"),
-        option("--minutes", "M", "how long to go on", dest="seconds", type=minutes),
+        seconds_of("--seconds", "how long to run"),
+        option("--minutes", "M", "how long to run", dest="seconds", type=minutes),
     )),
     flag("--keep-going", "do not stop at a violation"),
     option("--shrink", "S",
@@ -48,8 +48,8 @@ _CHAOS: Final = OptionGroup("real daemons and clients", (
              " network that is slow and loses frames now and then, and check what they saw"),
         file_of("--history", "FOLDER", "check once more what an earlier run has kept"),
     )),
-    counted("--shards", "default: 3", 3),
-    counted("--actors", "default: 8", 8),
+    counted("--shards", "number of shards (default: 3)", 3),
+    counted("--actors", "number of actors (default: 8)", 8),
     file_of("--keep", "FOLDER", "a new folder that keeps journals and data"),
     flag("--require-namespaces",
          "fail where there are no namespaces, instead of leaving out what needs a network"),

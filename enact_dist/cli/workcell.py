@@ -49,8 +49,8 @@ VERBS: Final = (
             option("--board", "B",
                    "COLUMNSxROWS,SQUARE_M,MARKER_M,DICTIONARY[,legacy] as it was printed (default:"
                    f" {BOARD}, which fits on A4)", default=BOARD),
-            file_of("--print-board", "FILE", "write it to print: .pdf, .svg or .png"),
-            file_of("--out", "FILE", "what is written (default: FOLDER/cameras.json)"),
+            file_of("--print-board", "FILE", "write the board for printing: .pdf, .svg or .png"),
+            file_of("--out", "FILE", "file of the calibration (default: FOLDER/cameras.json)"),
             option("--origin", "MOMENT",
                    "the board lay at the cell's origin then: its lower left corner, x right, y up"
                    " the sheet, z out of it (default: a moment at which most cameras saw it)",

@@ -215,7 +215,7 @@ def test_missing_cell_is_named_with_its_remedies(enact, tmp_path):
     assert result.status == 2
     assert result.err == (
         f"enact: no cell: there is no cell.toml in {tmp_path}; name one with --cell FILE or"
-        " --cell tcp/host:7447, or set ENACT_CELL\n"
+        " --cell tcp/host:7447, or set ENACT_CELL (docs/cell.md explains the file)\n"
     )
 
 

@@ -22,7 +22,7 @@ CHECK_S: Final = 2.0
 """How long a health check waits: it is called every few seconds, and a local answer takes 1 ms."""
 
 _NAME: Final = option("name", "NAME", "name of the shard in cell.toml")
-_FOLDER: Final = file_of("--folder", "DIR", "the shard's, if not as usual")
+_FOLDER: Final = file_of("--folder", "DIR", "folder of the shard, unless it is that of cell.toml")
 
 
 def _path(name: str, text: str) -> Option:
@@ -70,8 +70,8 @@ VERBS: Final = (
         (
             option("name", "NAME", "name of the shard (default: each one of the cell)", nargs="?"),
             OneOf((
-                flag("--ready", "it answers and grants locks (the default)"),
-                flag("--alive", "it answers"),
+                flag("--ready", "check that it answers and grants locks (the default)"),
+                flag("--alive", "check that it answers"),
             )),
             *READER,
         ),

@@ -51,7 +51,8 @@ def run_restore(options: argparse.Namespace) -> Output:
     if not backup.digests:
         print(
             f"enact: warning: {options.path} was made before backups had digests: what a shard's"
-            " start checks was checked, and not every byte of it compared; make a new backup",
+            " start checks was checked, and not every byte of it compared; make a new backup"
+            " (see docs/operations.md)",
             file=sys.stderr,
         )
     made = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(backup.unix_s))

@@ -108,7 +108,8 @@ def _folder(shard: ShardConfig, stores: dict[str, str], new: list[str], config: 
         where = f"is on host {shard.host}" if elsewhere else f"has no data in {folder}"
         raise ConfigError(
             f"shard {name} {where}: copy its folder here and name it with --store {name}=PATH;"
-            f" if the shard is new, say --new {name}" + (" as well" if elsewhere else "")
+            f" if the shard is new, say --new {name}{' as well' if elsewhere else ''}"
+            " (see docs/operations.md)"
         )
     return folder
 

@@ -87,7 +87,7 @@ VERBS: Final = (
     Verb(
         "create", "make a world context, unless the cell has it", "contents:create_world",
         "enact world create planning",
-        (option("world", "NAME", "of the world context", type=world_name), *READER),
+        (option("world", "NAME", "name of the world context", type=world_name), *READER),
         cell=CHANGES,
     ),
     Verb(
@@ -120,7 +120,7 @@ VERBS: Final = (
             WORLD,
             SLOT,
             counted("--count", "only the newest N"),
-            _at("--since", "only what was current after it"),
+            _at("--since", "only versions that were current after this moment"),
             *READER,
         ),
         cell=LOOKS,
@@ -135,7 +135,7 @@ VERBS: Final = (
         (
             WORLD,
             _at("moment", MOMENT_HELP),
-            option("what", None, "(default: tree)", nargs="?", choices=("tree", "get"),
+            option("what", None, "what to show (default: tree)", nargs="?", choices=("tree", "get"),
                    default="tree"),
             option("name", "NAME", "a pattern of entities (default: all), or ENTITY/ASPECT for get",
                    nargs="?"),
@@ -150,8 +150,8 @@ VERBS: Final = (
         "enact world fork online what_if --at -30s",
         (
             WORLD,
-            option("name", "NAME", "of the new world context"),
-            _at("--at", f"as it was; {MOMENT_HELP}"),
+            option("name", "NAME", "name of the new world context"),
+            _at("--at", f"copy the context as of {MOMENT_HELP}"),
             *READER,
         ),
         cell=CHANGES,
@@ -205,12 +205,12 @@ VERBS: Final = (
             option("entities", "PATTERN", "only entities whose names match (default: all)",
                    nargs="?", type=entities, default="**"),
             ASPECTS,
-            _at("--at1", f"the first as of {MOMENT_HELP}"),
-            _at("--at2", "the second as of a moment"),
+            _at("--at1", f"compare the first as of {MOMENT_HELP}"),
+            _at("--at2", "compare the second as of a moment, likewise"),
             many("--tolerance", "[ASPECT=]X",
                  "how far numbers may be apart, in their unit, or in percent of the larger (1%%);"
-                 " wins over cell.toml, and holds for every aspect that has none where none is"
-                 " named", type=tolerance, default=[]),
+                 " this overrides cell.toml; without ASPECT it holds for every aspect that"
+                 " has no tolerance of its own", type=tolerance, default=[]),
             flag("--all", "list every slot that only one side has"),
             flag("--trust",
                  "run every module that a `compare` in cell.toml names, not only those in the"
@@ -228,9 +228,10 @@ VERBS: Final = (
         (
             WORLD,
             option("--out", "FILE|FOLDER", "a new FILE.mcap, or a new folder", required=True),
-            _at("--at", f"as of {MOMENT_HELP}"),
+            _at("--at", f"write the context as of {MOMENT_HELP}"),
             many("--shows", "ASPECT=KIND", "as for enact record", type=pair),
-            option("--compress", None, "of an .mcap file", choices=COMPRESSIONS, default="zstd"),
+            option("--compress", None, "compression of an .mcap file (default: zstd)",
+                   choices=COMPRESSIONS, default="zstd"),
             *READER,
         ),
         cell=LOOKS,
