@@ -2,69 +2,54 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
-from enact_dist.cli.text.output import coloured, print_json
-from enact_dist.cli.verbs import DONE, FAILED, NOUNS, add_reader, add_verb, cell_target
+from enact_dist.cli.arguments import READER
+from enact_dist.cli.target import cell_target
+from enact_dist.cli.text.output import coloured
+from enact_dist.cli.verbs import DONE, FAILED, NOUNS, Output, Verb
 from enact_dist.errors import ConfigError
 from enact_dist.wire.texts import shown
 
 if TYPE_CHECKING:
     import argparse
 
-    from enact_dist.cli.verbs import Verb
-
-_COLOUR_INDEX = {"ok": 3, "warn": 1, "FAIL": 5}
-
-
-def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
-    """Add the verb, which has no noun."""
-    doctor = add_verb(
-        nouns,
-        "doctor",
-        NOUNS["doctor"].summary,
-        run=run_doctor,
-        example="enact doctor --cell cell.toml",
-    )
-    add_reader(doctor)
+_TEXTS: Final = ("subject", "text", "remedy")
+_COLOUR_INDEX: Final = {"ok": 3, "warn": 1, "FAIL": 5}
 
 
-def run_doctor(arguments: argparse.Namespace) -> int:
-    """Print one line per check; status 1 if one of them failed."""
+VERBS: Final = (
+    Verb(
+        "doctor", NOUNS["doctor"].summary, "run_doctor", "enact doctor --cell cell.toml", READER
+    ),
+)  # fmt: skip
+
+
+def run_doctor(options: argparse.Namespace) -> Output:
+    """Print one line per check as it ends; status 1 if one of them failed."""
     from enact_dist.operate.doctor import examine
     from enact_dist.operate.doctor_cell import Level
 
-    target = _target(arguments)
-    findings = []
-    for finding in examine(target, timeout_s=arguments.timeout_s):
-        findings.append(finding)
-        if not arguments.json:
-            mark = coloured(f"{finding.level.value:4}", _COLOUR_INDEX[finding.level.value])
+    facts, status = [], DONE
+    for finding in examine(_target(options), timeout_s=options.timeout_s):
+        level = finding.level.value
+        facts.append({"level": level, **{key: getattr(finding, key) for key in _TEXTS}})
+        status = FAILED if finding.level is Level.FAIL else status
+        if not options.json:
+            mark = coloured(f"{level:4}", _COLOUR_INDEX[level])
             print(f"{mark}  {shown(f'{finding.subject}: {finding.text}')}", flush=True)
             if finding.remedy:
                 print(f"      → {finding.remedy}", flush=True)
-    if arguments.json:
-        print_json(
-            [
-                {
-                    "level": finding.level.value,
-                    "subject": finding.subject,
-                    "text": finding.text,
-                    "remedy": finding.remedy,
-                }
-                for finding in findings
-            ]
-        )
-    return FAILED if any(finding.level is Level.FAIL for finding in findings) else DONE
+    return Output(facts, status=status)
 
 
-def _target(arguments: argparse.Namespace) -> str:
+def _target(options: argparse.Namespace) -> str:
     """Return the cell, or the empty string where none is named: the machine can still be checked.
 
     Raises:
         ConfigError: The file that was named does not exist.
     """
     try:
-        return cell_target(arguments)
+        return cell_target(options)
     except ConfigError:
         return ""

@@ -9,21 +9,18 @@ import sys
 from datetime import datetime
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.cli.text.output import print_json, print_table, shown_s
-from enact_dist.cli.verbs import (
-    DONE,
-    UNREACHABLE,
-    add_cell,
-    add_noun,
-    add_reader,
-    add_timeout,
-    add_verb,
-    open_cell,
-    seconds,
+from enact_dist.cli.arguments import (
+    CELL,
+    READER,
+    TIMEOUT,
+    in_words,
+    seconds_of,
     slot_parts,
-    verbs_of,
     whole,
 )
+from enact_dist.cli.target import open_cell
+from enact_dist.cli.text.output import shown_s
+from enact_dist.cli.verbs import DONE, LOOKS, UNREACHABLE, Output, Verb, option
 from enact_dist.errors import ConfigError, LeaseLostError, MisuseError, ShardUnreachableError
 from enact_dist.link.signals import StopSignals
 from enact_dist.terms import Access, Entities, Entity, checked_name
@@ -32,7 +29,6 @@ from enact_dist.wire.texts import shown
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from enact_dist.cli.verbs import Verb
     from enact_dist.core.protocol.messages import Item
     from enact_dist.link.client.locks import CellClient
     from enact_dist.world.cell import Cell
@@ -43,6 +39,7 @@ POLL_S: Final = 0.05
 
 _HELD: Final = re.compile(r"(?:(?P<world>[^:/]+):)?(?P<slot>[^:]+):(?P<access>read|write)\Z")
 
+_SHARD: Final = option("--shard", "NAME", "needed where two shards use the number")
 _ACCESSES: Final = {
     ("read", False): Access.READ,
     ("write", False): Access.WRITE,
@@ -51,118 +48,105 @@ _ACCESSES: Final = {
 }
 
 
-def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
-    """Add the noun and its verbs."""
-    verbs = verbs_of(add_noun(nouns, "lock"))
-    ls = add_verb(
-        verbs,
-        "ls",
-        "list who holds what and who waits for whom",
-        run=list_locks,
-        example="enact lock ls",
-    )
-    add_reader(ls)
-    _add_hold(verbs)
-    _add_break(verbs)
-    _add_resolve(verbs)
-    _add_audit(verbs)
+@in_words()
+def held(text: str) -> tuple[str, str, str, str]:
+    """Read ``[WORLD:]ENTITY/ASPECT:read|write``; an `argparse` type."""
+    found = _HELD.match(text)
+    if found is None:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not written [WORLD:]ENTITY/ASPECT:read or …:write"
+        )
+    entity, aspect = slot_parts(found["slot"])
+    (Entities if "*" in entity else Entity)(entity)
+    checked_name("aspect", aspect, slashes=False)
+    return found["world"] or "", entity, aspect, found["access"]
 
 
-def _add_hold(verbs: argparse._SubParsersAction[Verb]) -> None:
-    hold = add_verb(
-        verbs,
+VERBS: Final = (
+    Verb(
+        "ls", "list who holds what and who waits for whom", "list_locks",
+        "enact lock ls",
+        READER,
+        cell=LOOKS,
+        columns=("lock", "shard", "who", "state", "mode", "age", "lease left", "hold left", "data",
+                 "waits for"),
+        empty="no lock is held or awaited",
+    ),
+    Verb(
         "hold",
-        "run a command while holding a lock; status is the command's, 1 if the lock is lost, 3 if"
-        " its shard does not answer; either ends the command",
-        run=hold_lock,
-        example="enact lock hold online:robot/pose:write -- ./calibrate.sh\n"
+        "run a command while holding a lock; the exit status is the command's, 1 if the lock is"
+        " lost, 3 if its shard does not answer; either ends the command",
+        "hold_lock",
+        "enact lock hold online:robot/pose:write -- ./calibrate.sh\n"
         "enact lock hold --world online robot/pose:write 'tray/*/surface:read' -- sleep 5",
-    )
-    hold.usage = "enact lock hold [options] [WORLD:]ENTITY/ASPECT:read|write … -- COMMAND …"
-    hold.add_argument(
-        "requests",
-        nargs="+",
-        type=held,
-        metavar="[WORLD:]ENTITY/ASPECT:MODE",
-        help="what to hold; MODE is read or write; an entity with * means all that match",
-    )
-    hold.add_argument("--world", metavar="WORLD", help="of requests that name none")
-    hold.add_argument("--wait", type=seconds, default=10.0, metavar="S", help="for the grant")
-    hold.add_argument(
-        "--hold", type=seconds, default=3600.0, metavar="S", help="at most (default: 3600)"
-    )
-    add_cell(hold)
-    add_timeout(hold)
-
-
-def _add_break(verbs: argparse._SubParsersAction[Verb]) -> None:
-    cut = add_verb(
-        verbs,
-        "break",
-        "take a lock away from its holder, who learns why; its commit will be refused",
-        run=break_lock,
-        example="enact lock break 1742 --shard left --reason 'camera unplugged'",
-    )
-    cut.add_argument("number", type=whole, metavar="NUMBER", help="as `enact lock ls` shows it")
-    cut.add_argument("--shard", metavar="NAME", help="needed where two shards use the number")
-    cut.add_argument("--reason", default="broken by hand", metavar="TEXT", help="for the holder")
-    add_reader(cut)
-
-
-def _add_resolve(verbs: argparse._SubParsersAction[Verb]) -> None:
-    resolve = add_verb(
-        verbs,
-        "resolve",
-        "give up a lock in doubt whose deciding shard is lost for good (audited)",
-        run=resolve_lock,
-        example="enact lock resolve --force-abort 17 --shard right --reason 'disk of left is gone'",
-    )
-    resolve.add_argument(
-        "--force-abort",
-        required=True,
-        type=whole,
-        metavar="LOCK",
-        help="its number in `enact lock ls`; if the lost shard had committed it, only a part of"
-        " that commit stands: restore that shard's folder first wherever you can",
-    )
-    resolve.add_argument("--shard", metavar="NAME", help="needed where two shards use the number")
-    resolve.add_argument("--reason", required=True, metavar="TEXT", help="for the audit record")
-    add_reader(resolve)
-
-
-def _add_audit(verbs: argparse._SubParsersAction[Verb]) -> None:
-    audit = add_verb(
-        verbs,
+        (
+            option("requests", "[WORLD:]ENTITY/ASPECT:MODE",
+                   "what to hold; MODE is read or write; an entity with * means all that match",
+                   nargs="+", type=held),
+            option("--world", "WORLD", "world context of requests that name none"),
+            seconds_of("--wait", "how long to wait for the grant (default: 10)", 10.0),
+            seconds_of("--hold", "how long to hold the lock at most (default: 3600)", 3600.0),
+            CELL,
+            TIMEOUT,
+        ),
+        settings={"usage": "enact lock hold [options] [WORLD:]ENTITY/ASPECT:read|write …"
+                           " -- COMMAND …"},
+    ),
+    Verb(
+        "break", "take a lock away from its holder, who learns why; its commit will be refused",
+        "break_lock",
+        "enact lock break 1742 --shard left --reason 'camera unplugged'",
+        (
+            option("number", "NUMBER", "as `enact lock ls` shows it", type=whole),
+            _SHARD,
+            option("--reason", "TEXT", "reason that the holder sees", default="broken by hand"),
+            *READER,
+        ),
+        cell=LOOKS,
+    ),
+    Verb(
+        "resolve", "give up a lock in doubt whose deciding shard is lost for good (audited)",
+        "resolve_lock",
+        "enact lock resolve --force-abort 17 --shard right --reason 'disk of left is gone'",
+        (
+            option("--force-abort", "LOCK",
+                   "its number in `enact lock ls`; if the lost shard had committed it, only a part"
+                   " of that commit stands: restore that shard's folder first wherever you can",
+                   required=True, type=whole),
+            _SHARD,
+            option("--reason", "TEXT", "reason for the audit record", required=True),
+            *READER,
+        ),
+        cell=LOOKS,
+        page="limits",
+    ),
+    Verb(
         "audit",
         "list locks that were ended by hand, and alarms: commits that stand only in part since",
-        run=list_audit,
-        example="enact lock audit\n"
-        "enact lock audit --settle 'bench/contacts written again from left' --shard right",
-    )
-    audit.add_argument("--settle", metavar="TEXT", help="say how all alarms so far were seen to")
-    audit.add_argument("--shard", metavar="NAME", help="whose alarms; needed with --settle")
-    add_reader(audit)
+        "list_audit",
+        "enact lock audit\n"
+        "enact lock audit --acknowledge 'bench/contacts written again from left' --shard right",
+        (
+            option("--acknowledge", "TEXT", "record what was done about all alarms so far"),
+            option("--shard", "NAME", "whose alarms; needed with --acknowledge"),
+            *READER,
+        ),
+        columns=("when", "shard", "what", "by", "details"),
+        empty="no lock was ended by hand",
+        page="limits",
+    ),
+)  # fmt: skip
 
 
 # ---------------------------------------------------------------- ls
 
 
-def list_locks(arguments: argparse.Namespace) -> int:
-    """Print all locks of the cell, held or awaited; status 3 if a shard does not answer."""
-    with open_cell(arguments) as cell:
-        shards, status = in_reach(cell)
-        locks = cell.locks(shards)
-    if arguments.json:
-        print_json(locks)
-        return status
+def list_locks(cell: Cell, _options: argparse.Namespace) -> Output:
+    """List all locks of the cell, held or awaited; status 3 if a shard does not answer."""
+    shards, status = in_reach(cell)
+    locks = cell.locks(shards)
     known = {(lock.shard, lock.number): lock for lock in locks}
-    print_table(
-        ("lock", "shard", "who", "state", "mode", "age", "lease left", "hold left", "data",
-         "waits for"),
-        [_row(lock, known) for lock in locks],
-        empty="no lock is held or awaited",
-    )  # fmt: skip
-    return status
+    return Output(locks, rows=[_row(lock, known) for lock in locks], status=status)
 
 
 def in_reach(cell: Cell) -> tuple[tuple[str, ...], int]:
@@ -209,47 +193,31 @@ def _blocker(number: int, lock: LockInfo | None) -> str:
 # ---------------------------------------------------------------- hold
 
 
-def held(text: str) -> tuple[str, str, str, str]:
-    """Read ``[WORLD:]ENTITY/ASPECT:read|write``; an `argparse` type."""
-    found = _HELD.match(text)
-    if found is None:
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is not written [WORLD:]ENTITY/ASPECT:read or …:write"
-        )
-    entity, aspect = slot_parts(found["slot"])
-    try:
-        (Entities if "*" in entity else Entity)(entity)
-        checked_name("aspect", aspect, slashes=False)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
-    return found["world"] or "", entity, aspect, found["access"]
-
-
-def hold_lock(arguments: argparse.Namespace) -> int:
+def hold_lock(options: argparse.Namespace) -> int:
     """Hold a lock while a command runs."""
-    if not arguments.command:
+    if not options.command:
         raise ConfigError("lock hold needs a command: enact lock hold REQUEST … -- COMMAND …")
     with (
         StopSignals() as stop,
-        open_cell(arguments, observer=False, actor=_command_name(arguments)) as cell,
+        open_cell(options, observer=False, actor=_command_name(options)) as cell,
     ):
-        return _hold(cell, arguments, stop)
+        return _hold(cell, options, stop)
 
 
-def _hold(cell: Cell, arguments: argparse.Namespace, stop: StopSignals) -> int:
+def _hold(cell: Cell, options: argparse.Namespace, stop: StopSignals) -> int:
     from enact_dist.cli.held_command import HeldCommand
 
-    items = [_item(cell, request, arguments.world) for request in arguments.requests]
+    items = [_item(cell, request, options.world) for request in options.requests]
     client = cell.world(items[0].context).session.client
     entries = client.aspect_entries()
     client.register(
         aspects=[entries[item.aspect]._replace(reads=True) for item in items],
         needed=lambda: _shards_of(client, items),
     )
-    lock = client.acquire(items, wait_s=arguments.wait, hold_s=arguments.hold)
-    name, by_itself = arguments.command[0], False
+    lock = client.acquire(items, wait_s=options.wait, hold_s=options.hold)
+    name, by_itself = options.command[0], False
     try:
-        with HeldCommand(arguments.command) as running:
+        with HeldCommand(options.command) as running:
             while not running.wait(POLL_S):
                 running.pass_on(stop)
                 if not client.valid(lock):
@@ -281,8 +249,8 @@ def _shards_of(client: CellClient, items: Iterable[Item]) -> Iterator[str]:
         yield from client.shards() if "*" in item.entity else (client.shard_of(item.entity),)
 
 
-def _command_name(arguments: argparse.Namespace) -> str:
-    return f"hold:{os.path.basename(arguments.command[0])}"  # noqa: PTH119 (a word, not a file)
+def _command_name(options: argparse.Namespace) -> str:
+    return f"hold:{os.path.basename(options.command[0])}"  # noqa: PTH119 (a word, not a file)
 
 
 def _item(cell: Cell, request: tuple[str, str, str, str], default: str | None) -> Item:
@@ -307,66 +275,49 @@ def _item(cell: Cell, request: tuple[str, str, str, str], default: str | None) -
     return Item(int(_ACCESSES[access, "*" in entity]), world, entity, aspect)
 
 
-# ---------------------------------------------------------------- break
+# ---------------------------------------------------------------- break, resolve, audit
 
 
-def break_lock(arguments: argparse.Namespace) -> int:
+def break_lock(cell: Cell, options: argparse.Namespace) -> Output:
     """Take a lock away by its number."""
-    with open_cell(arguments) as cell:
-        shard = arguments.shard or _shard_of(arguments.number, cell)
-        broken = cell.break_lock(arguments.number, shard=shard, reason=arguments.reason)
+    number, reason = options.number, options.reason
+    shard = options.shard or _shard_of(number, cell)
+    broken = cell.break_lock(number, shard=shard, reason=reason)
     if broken is None:
-        raise MisuseError(f"shard {shard} knows no lock {arguments.number}; see enact lock ls")
-    if arguments.json:
-        print_json(broken)
-    else:
-        state = "held" if broken.granted else "awaited"
-        print(
-            f"broke lock {broken.number} on {shard}, {state} by {who(broken)}: {arguments.reason}"
-        )
-    return DONE
+        raise MisuseError(f"shard {shard} knows no lock {number}; see enact lock ls")
+    state = "held" if broken.granted else "awaited"
+    return Output(broken, f"broke lock {number} on {shard}, {state} by {who(broken)}: {reason}")
 
 
-def resolve_lock(arguments: argparse.Namespace) -> int:
+def resolve_lock(cell: Cell, options: argparse.Namespace) -> Output:
     """Abort a lock in doubt by its number."""
-    number, reason = arguments.force_abort, arguments.reason
-    with open_cell(arguments) as cell:
-        shard = arguments.shard or _shard_of(number, cell)
-        given_up = cell.force_abort(number, shard=shard, reason=reason)
+    number, reason = options.force_abort, options.reason
+    shard = options.shard or _shard_of(number, cell)
+    given_up = cell.force_abort(number, shard=shard, reason=reason)
     if given_up is None:
         raise MisuseError(
             f"lock {number} on shard {shard} is not in doubt, so nothing was done; see"
             " enact lock ls (enact lock break takes a lock from its holder)"
         )
-    if arguments.json:
-        print_json(given_up)
-    else:
-        print(f"gave up lock {number} on {shard}, in doubt for {who(given_up)}: {reason}")
-    return DONE
+    return Output(
+        given_up, f"gave up lock {number} on {shard}, in doubt for {who(given_up)}: {reason}"
+    )
 
 
-# ---------------------------------------------------------------- audit
-
-
-def list_audit(arguments: argparse.Namespace) -> int:
-    """Print what operators did and what came of it; with `--settle`, first add to it."""
-    if (arguments.settle is None) != (arguments.shard is None):
-        raise ConfigError("--settle TEXT and --shard NAME go together")
-    with open_cell(arguments) as cell:
-        if arguments.settle is not None:
-            cell.settle_alarms(shard=arguments.shard, how=arguments.settle)
+def list_audit(options: argparse.Namespace) -> Output:
+    """List what operators did and what came of it; with `--acknowledge`, first add to it."""
+    if (options.acknowledge is None) != (options.shard is None):
+        raise ConfigError("--acknowledge TEXT and --shard NAME go together")
+    with open_cell(options) as cell:
+        if options.acknowledge is not None:
+            cell.settle_alarms(shard=options.shard, how=options.acknowledge)
         shards, status = in_reach(cell)
         entries = cell.audit(shards)
-    if arguments.json:
-        print_json(entries)
-        return status
     rows = [
         (_local_time(one.stamp_s), one.shard, one.kind, one.identity or "-", one.text)
         for one in entries
     ]
-    columns = ("when", "shard", "what", "by", "details")
-    print_table(columns, rows, empty="no lock was ended by hand")
-    return status
+    return Output(entries, rows=rows, status=status)
 
 
 def _local_time(stamp_s: float) -> str:

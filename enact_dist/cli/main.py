@@ -18,10 +18,18 @@ import argparse
 import os
 import re
 import sys
-from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
-from enact_dist.cli.verbs import DONE, NOUNS, USAGE, exit_status, told
+from enact_dist.cli.verbs import (
+    DONE,
+    NOUNS,
+    USAGE,
+    add_noun,
+    exit_status,
+    renamed,
+    run_verb,
+    told,
+)
 from enact_dist.errors import EnactError
 
 if TYPE_CHECKING:
@@ -76,8 +84,8 @@ class _Parser(argparse.ArgumentParser):
 def build_parser(noun: str = "") -> argparse.ArgumentParser:
     """Return the parser of all nouns and verbs, or of one noun: that loads a third as much."""
     parser, nouns = _top_parser()
-    for module in dict.fromkeys(NOUNS[name].module for name in ([noun] if noun else NOUNS)):
-        import_module(f"enact_dist.cli.{module}").add_to(nouns)
+    for name in [noun] if noun else NOUNS:
+        add_noun(nouns, name)
     return parser
 
 
@@ -119,6 +127,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _main(words: list[str]) -> int:
     words, command = _split_command(words)
     noun = next((word for word in words if not word.startswith("-")), "")
+    words, remarks = renamed(noun, words)
+    for remark in remarks:
+        print(f"enact: {remark}", file=sys.stderr)
     parser = build_parser(noun) if noun in NOUNS else _overview()
     arguments = parser.parse_args(words)
     arguments.command = command
@@ -153,7 +164,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
     try:
         end_with_supervisor()
-        status: int = arguments.run(arguments)
+        status = run_verb(arguments)
         sys.stdout.flush()
     except EnactError as error:
         return _report(error, arguments)

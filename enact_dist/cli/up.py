@@ -8,16 +8,10 @@ import sys
 import time
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.cli.arguments import LOG
+from enact_dist.cli.target import CELL_DEFAULT, CELL_VARIABLE, cell_config, see_modules
 from enact_dist.cli.text.output import coloured
-from enact_dist.cli.verbs import (
-    CELL_DEFAULT,
-    CELL_VARIABLE,
-    NOUNS,
-    add_log,
-    add_verb,
-    cell_config,
-    see_modules,
-)
+from enact_dist.cli.verbs import NOUNS, Verb, flag, option
 from enact_dist.config.table import suggestion
 from enact_dist.config.types import processes_of
 from enact_dist.errors import ConfigError, LinkError
@@ -27,7 +21,6 @@ if TYPE_CHECKING:
     import argparse
     from collections.abc import Sequence
 
-    from enact_dist.cli.verbs import Verb
     from enact_dist.config.types import ActorProcess, CellConfig, ShardConfig
     from enact_dist.operate.supervise import Say, Task
 
@@ -37,46 +30,38 @@ ANSWER_S: Final = 2.0
 """How long who listens where a shard should may take to say what it is."""
 
 
-def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
-    """Add the verb, which has no noun."""
-    up = add_verb(
-        nouns,
-        "up",
-        NOUNS["up"].summary,
-        run=run_up,
-        example="enact up cell.toml\nenact up cell.toml --no-actors\n"
+VERBS: Final = (
+    Verb(
+        "up", NOUNS["up"].summary, "run_up",
+        "enact up cell.toml\nenact up cell.toml --no-actors\n"
         "enact up cell.toml --without camera planner",
-    )
-    up.add_argument(
-        "cell",
-        metavar="CELL",
-        nargs="?",
-        help=f"the cell.toml (default: ${CELL_VARIABLE}, else ./{CELL_DEFAULT})",
-    )
-    up.add_argument("--host", metavar="NAME", help="act as this machine (default: its host name)")
-    up.add_argument("--no-actors", action="store_true", help="run the shards only")
-    for option, what in (("--only", "run these"), ("--without", "run all but these")):
-        up.add_argument(
-            option,
-            nargs="+",
-            default=[],
-            metavar="NAME",
-            help=f"{what} shards, actors and processes of this machine",
-        )
-    add_log(up)
+        (
+            option("cell", "CELL", f"the cell.toml (default: ${CELL_VARIABLE}, else"
+                   f" ./{CELL_DEFAULT})", nargs="?"),
+            option("--host", "NAME", "act as this machine (default: its host name)"),
+            flag("--no-actors", "run the shards only"),
+            option("--only", "NAME", "run these shards, actors and processes of this machine",
+                   nargs="+", default=[]),
+            option("--without", "NAME",
+                   "run all but these shards, actors and processes of this machine",
+                   nargs="+", default=[]),
+            LOG,
+        ),
+    ),
+)  # fmt: skip
 
 
-def run_up(arguments: argparse.Namespace) -> int:
+def run_up(options: argparse.Namespace) -> int:
     """Run the cell until a signal; drain actors, then shards."""
     from enact_dist.operate.supervise import Supervisor
 
-    config = cell_config(arguments)
+    config = cell_config(options)
     see_modules(config.path)
-    host = arguments.host or socket.gethostname()
-    chosen = _chosen(config, arguments)
+    host = options.host or socket.gethostname()
+    chosen = _chosen(config, options)
     shards = [one for one in config.shards if one.host in {"", host} and one.name in chosen]
     actors = [one for one in config.actors if one.host in {"", host} and one.name in chosen]
-    actors = [] if arguments.no_actors else actors
+    actors = [] if options.no_actors else actors
     if not shards and not actors:
         raise ConfigError(f"no shard and no actor of {config.path} runs on host {host!r}")
     _refuse_homeless(config, shards, host)
@@ -85,11 +70,11 @@ def run_up(arguments: argparse.Namespace) -> int:
     for shard in shards:
         _refuse_second(config, shard)
     tasks = [
-        *(_task(config, "shard", shard.name, arguments.log, shard.drain_s) for shard in shards),
-        *(_actor_task(config, process, arguments.log) for process in processes_of(actors)),
+        *(_task(config, "shard", shard.name, options.log, shard.drain_s) for shard in shards),
+        *(_actor_task(config, process, options.log) for process in processes_of(actors)),
     ]
     say: Say = _Log([task.name for task in tasks])
-    if arguments.log == "json":
+    if options.log == "json":
         shared = {process.name for process in config.processes() if len(process.actors) > 1}
         kinds = {task.name: "process" if task.name in shared else task.kind for task in tasks}
         say = _JsonLog(config.name, {name: f"{kind} {name}" for name, kind in kinds.items()})
@@ -102,7 +87,7 @@ def run_up(arguments: argparse.Namespace) -> int:
     return status
 
 
-def _chosen(config: CellConfig, arguments: argparse.Namespace) -> set[str]:
+def _chosen(config: CellConfig, options: argparse.Namespace) -> set[str]:
     """Return the names of the shards and actors that are to run, wherever they belong.
 
     The name of a process stands for all its actors, unless one of them has it, too.
@@ -113,7 +98,7 @@ def _chosen(config: CellConfig, arguments: argparse.Namespace) -> set[str]:
     known = {one.name for one in config.shards} | {one.name for one in config.actors}
     meant = {process.name: set(process.members) for process in config.processes()}
     meant |= {name: {name} for name in known}
-    for name in (*arguments.only, *arguments.without):
+    for name in (*options.only, *options.without):
         if name not in meant:
             raise ConfigError(
                 f"{config.path} has no shard and no actor {name!r}{suggestion(name, meant)} (it has"
@@ -121,13 +106,13 @@ def _chosen(config: CellConfig, arguments: argparse.Namespace) -> set[str]:
             )
     only, without = (
         {each for name in names for each in meant[name]}
-        for names in (arguments.only, arguments.without)
+        for names in (options.only, options.without)
     )
     chosen = (only or known) - without
     if not chosen:
-        said = f"--only {' '.join(arguments.only)} " if arguments.only else ""
+        said = f"--only {' '.join(options.only)} " if options.only else ""
         raise ConfigError(
-            f"{said}--without {' '.join(arguments.without)} leaves nothing of {config.path} to run;"
+            f"{said}--without {' '.join(options.without)} leaves nothing of {config.path} to run;"
             " name fewer after --without"
         )
     return chosen

@@ -1,22 +1,23 @@
-"""What all verbs share: options, how a cell is named and joined, clean ends on signals."""
+"""Verbs as tables, and the one engine that reads their options, runs them and prints the output.
+
+A noun of `enact` is a module with a tuple `VERBS`: one `Verb` for each, which says everything that
+its help does.  It names the function that carries it out, so that this one is loaded at use.  Such
+a function takes a cell and the options, or the options alone, and returns an `Output` or, where it
+prints for itself, an exit status.
+"""
 
 from __future__ import annotations
 
 import argparse
-import os
-import sys
-from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from dataclasses import dataclass, field
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from enact_dist.errors import ConfigError, ShardUnreachableError
-from enact_dist.terms import Entities, Entity, checked_name
 from enact_dist.wire.texts import shown
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from enact_dist.config.types import CellConfig
-    from enact_dist.world.cell import Cell
+    from collections.abc import Callable, Mapping, Sequence
 
 DONE: Final = 0
 FAILED: Final = 1
@@ -24,304 +25,274 @@ USAGE: Final = 2
 UNREACHABLE: Final = 3
 DIFFERENT: Final = 4
 
-CELL_VARIABLE: Final = "ENACT_CELL"
-CELL_DEFAULT: Final = "cell.toml"
-TIMEOUT_S: Final = 5.0
-
-Verb = argparse.ArgumentParser
-"""A parser of one verb, as `add_verb` returns it."""
+LOOKS: Final = "looks"
+CHANGES: Final = "changes"
+"""How a verb joins the cell; without either it does so by itself, or not at all."""
 
 
 class Noun(NamedTuple):
     """One command of `enact`.
 
     Attributes:
-        module: Where it stands, below `enact_dist.cli`; loaded when the command is used.
+        module: Where its table stands, below `enact_dist.cli`; loaded when the command is used.
         summary: What the help says of it.
+        page: The page of the documents that explains its subject.
     """
 
     module: str
     summary: str
+    page: str
 
 
 NOUNS: Final = {
-    "up": Noun("up", "run every shard and actor of a cell on this machine until Ctrl-C"),
-    "shard": Noun("shard.shard", "run and list shard daemons"),
-    "actor": Noun("actor.actor", "run, list and check actors"),
-    "world": Noun("world.world", "look into world contexts, make and compare them, set data"),
+    "up": Noun("up", "run every shard and actor of a cell on this machine until Ctrl-C", "cell"),
+    "shard": Noun("shard", "run, list, back up and rebalance shards", "operations"),
+    "actor": Noun("actor", "run, list, check and change actors", "own_actors"),
+    "world": Noun("world", "read, write, fork and compare world contexts", "guide"),
     "why": Noun(
-        "world.lineage", "show where a datum comes from: who committed it, what it was made of"
+        "world.lineage", "show where a datum comes from: who wrote it, and from which data", "time"
     ),
     "impact": Noun(
-        "world.lineage", "show what came of a datum: what it was used for, and that in turn"
+        "world.lineage", "show what was made from a datum, and from that in turn", "time"
     ),
     "record": Noun(
-        "record", "record every version of a cell's data into an MCAP file until Ctrl-C"
+        "record",
+        "record every version of a cell's data into an MCAP file until Ctrl-C",
+        "recordings",
     ),
-    "replay": Noun("record", "commit a recording into a cell again, at its pace"),
-    "lock": Noun("lock", "look at locks, hold one, break one, resolve one"),
+    "replay": Noun("record", "commit a recording into a cell again, at its pace", "recordings"),
+    "lock": Noun("lock", "list locks, hold one, break one, resolve one", "guide"),
     "doctor": Noun(
         "doctor",
-        "check this machine, the way to the cell, and whether that runs by its cell.toml:"
-        " libraries, memory, disk, shards, clocks",
+        "check this machine (libraries, memory, disk), the connection to the cell (shards, clocks),"
+        " and whether the running cell matches its cell.toml",
+        "operations",
     ),
     "bench": Noun(
         "bench",
         "measure locks, commits and data on this machine, beside the raw floor of the same run",
+        "benchmarks",
     ),
     "verify": Noun(
         "verify",
-        "try to break the locks and commits of this version: simulated faults, a judge, no mercy",
+        "try to break the locks and commits of this version with simulated faults, and check the"
+        " outcome",
+        "proof",
     ),
-    "demo": Noun("demo", "run a demonstration"),
-    "workcell": Noun("workcell", "calibrate the cameras of a cell"),
+    "demo": Noun("demo", "run a demonstration", "palletizing"),
+    "workcell": Noun("workcell", "calibrate the cameras of a cell", "workcell"),
 }
 """All commands, in the order in which `enact --help` shows them."""
 
 
-def add_noun(nouns: argparse._SubParsersAction[Verb], name: str) -> Verb:
-    """Add a noun and return its parser."""
-    summary = NOUNS[name].summary
-    return nouns.add_parser(name, help=summary, description=summary)
+FORMER: Final = {
+    "world": {"keep": "pin", "kept": "pinned", "let-go": "unpin"},
+    "why": {"--keep": "--pin"},
+    "lock": {"--settle": "--acknowledge"},
+}
+"""Names of the release before, by noun.  They work for one release more, but no help shows them."""
 
 
-def add_verb(
-    verbs: argparse._SubParsersAction[Verb],
-    name: str,
-    summary: str,
-    *,
-    run: Callable[[argparse.Namespace], int],
-    example: str,
-) -> Verb:
-    """Add a verb that `run` carries out; its help ends with `example`."""
-    parser = verbs.add_parser(
-        name,
-        help=summary,
-        description=f"{summary[0].upper()}{summary[1:]}.",
-        epilog="example"
-        + ("s" if "\n" in example else "")
-        + ":\n  "
-        + example.replace("\n", "\n  "),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+def renamed(noun: str, words: list[str]) -> tuple[list[str], list[str]]:
+    """Return a command line with the names of this release, and a remark on each former one."""
+    names, remarks = FORMER.get(noun, {}), []
+    plain = [at for at, word in enumerate(words) if not word.startswith("-")][:2]
+    new = list(words)
+    for at, word in enumerate(words):
+        name, equals, value = word.partition("=")
+        if name in names and (name.startswith("--") or at == plain[-1]):
+            new[at] = names[name] + equals + value
+            old, now = (f"enact {noun} {one}" for one in (name, names[name]))
+            remarks.append(f"{old} is now called {now}; the next release has the new name alone")
+    return new, remarks
+
+
+# ---------------------------------------------------------------- tables
+
+
+@dataclass(frozen=True, slots=True)
+class Option:
+    """One option or argument, as `argparse` takes it."""
+
+    names: tuple[str, ...]
+    settings: Mapping[str, Any]
+
+
+class OneOf(NamedTuple):
+    """Options of which at most one may be given."""
+
+    options: tuple[Option, ...]
+
+
+class OptionGroup(NamedTuple):
+    """Options that the help shows under a title of their own."""
+
+    title: str
+    options: tuple[Option | OneOf, ...]
+    description: str | None = None
+
+
+Part = Option | OneOf | OptionGroup
+
+
+def option(name: str, metavar: str | None, text: str, **settings: Any) -> Option:
+    """Return an option (``--name``) or an argument (``name``) that takes a value."""
+    given = {"help": text, "metavar": metavar, **settings}
+    return Option((name,), {key: value for key, value in given.items() if value is not None})
+
+
+def many(name: str, metavar: str, text: str, **settings: Any) -> Option:
+    """Return an option that may be repeated; its value is the list."""
+    return option(name, metavar, text, action="append", **settings)
+
+
+def flag(name: str, text: str) -> Option:
+    """Return an option without a value."""
+    return Option((name,), {"action": "store_true", "help": text})
+
+
+@dataclass(frozen=True, slots=True)
+class Verb:
+    """One verb of a noun, or a noun that is one.
+
+    Attributes:
+        name: Of the verb.
+        summary: What the help says of it.
+        run: Its function: ``module:name`` beside the noun's table, or ``name`` in that module.
+        examples: Command lines, one a line.
+        options: Its options and arguments, in the order of the help.
+        cell: `LOOKS` or `CHANGES` where the function takes a cell.
+        columns: Of the table that its rows make.
+        empty: Printed in place of a table without rows.
+        page: The page of the documents, unless it is that of the noun.
+        details: Further lines of the help, below the summary.
+        settings: Further settings of the parser.
+        defaults: Values of options in place of those that the options have.
+    """
+
+    name: str
+    summary: str
+    run: str
+    examples: str
+    options: tuple[Part, ...] = ()
+    cell: str = ""
+    columns: tuple[str, ...] = ()
+    empty: str = ""
+    page: str = ""
+    details: str = ""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    defaults: Mapping[str, Any] = field(default_factory=dict)
+
+
+def table_of(noun: str) -> tuple[Verb, ...]:
+    """Return the verbs of a noun; a noun that is a verb itself has one of its own name."""
+    verbs: tuple[Verb, ...] = import_module(f"enact_dist.cli.{NOUNS[noun].module}").VERBS
+    alone = tuple(verb for verb in verbs if verb.name == noun)
+    return alone or verbs
+
+
+def function_of(noun: str, verb: Verb) -> Callable[..., Output | int]:
+    """Load the function that carries out a verb."""
+    module, _, name = verb.run.rpartition(":")
+    place = ".".join(filter(None, ("enact_dist.cli", NOUNS[noun].module, module)))
+    function: Callable[..., Output | int] = getattr(import_module(place), name)
+    return function
+
+
+# ---------------------------------------------------------------- parsers
+
+
+def add_noun(nouns: argparse._SubParsersAction[Any], name: str) -> None:
+    """Add a noun with its verbs to the parser of all nouns."""
+    noun, table = NOUNS[name], table_of(name)
+    if table[0].name == name:
+        _add_verb(nouns, name, table[0])
+        return
+    parser = nouns.add_parser(
+        name, help=noun.summary, description=noun.summary, epilog=f"See docs/{noun.page}.md."
     )
-    parser.set_defaults(run=run)
+    verbs = parser.add_subparsers(metavar="VERB", required=True)
+    for verb in table:
+        _add_verb(verbs, name, verb)
+
+
+def _add_verb(verbs: argparse._SubParsersAction[Any], noun: str, verb: Verb) -> None:
+    examples = verb.examples.splitlines()
+    parser = verbs.add_parser(
+        verb.name,
+        help=verb.summary,
+        description=f"{verb.summary[0].upper()}{verb.summary[1:]}.{verb.details}",
+        epilog="\n  ".join([f"example{'s' if examples[1:] else ''}:", *examples])
+        + f"\n\nSee docs/{verb.page or NOUNS[noun].page}.md.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        **verb.settings,
+    )
     parser.add_argument(
         "--debug", action="store_true", default=argparse.SUPPRESS, help="show tracebacks of errors"
     )
-    return parser
+    _add_parts(parser, verb.options)
+    parser.set_defaults(verb=verb, **verb.defaults)
 
 
-def verbs_of(noun: Verb) -> argparse._SubParsersAction[Verb]:
-    """Return where the verbs of a noun are added."""
-    return noun.add_subparsers(metavar="VERB", required=True)
+def _add_parts(parser: Any, parts: Sequence[Part]) -> None:
+    for part in parts:
+        if isinstance(part, OptionGroup):
+            _add_parts(parser.add_argument_group(part.title, part.description), part.options)
+        elif isinstance(part, OneOf):
+            _add_parts(parser.add_mutually_exclusive_group(), part.options)
+        else:
+            parser.add_argument(*part.names, **part.settings)
 
 
-def add_cell(parser: Verb, *, file_only: bool = False) -> None:
-    """Add the option that names the cell; some verbs need what only its file says."""
-    parser.add_argument(
-        "--cell",
-        metavar="FILE" if file_only else "CELL",
-        help=("a cell.toml" if file_only else "a cell.toml or an endpoint such as tcp/host:7447")
-        + f" (default: ${CELL_VARIABLE}, else ./{CELL_DEFAULT})",
-    )
+# ---------------------------------------------------------------- output
 
 
-def add_world(parser: Verb) -> None:
-    """Add the name of the world context that a verb is about."""
-    parser.add_argument("world", metavar="WORLD", help="name of the world context")
+@dataclass(frozen=True, slots=True)
+class Output:
+    """What a verb found or did.
 
-
-def add_reader(parser: Verb) -> None:
-    """Add the options of a verb that only looks."""
-    add_cell(parser)
-    parser.add_argument("--json", action="store_true", help="print JSON instead of text")
-    add_timeout(parser)
-
-
-def add_timeout(parser: Verb) -> None:
-    """Add the option that says how long to wait for a shard."""
-    parser.add_argument(
-        "--timeout",
-        dest="timeout_s",
-        type=seconds,
-        default=TIMEOUT_S,
-        metavar="S",
-        help="seconds to wait for a shard that does not answer (default: 5)",
-    )
-
-
-def add_log(parser: Verb) -> None:
-    """Add the option that says what the log on standard error looks like."""
-    parser.add_argument(
-        "--log",
-        choices=("text", "json"),
-        default="text",
-        help="what the log looks like; json: an object per line (enact_dist.link.log)",
-    )
-
-
-def duration(text: str) -> float:
-    """Read a number of seconds, 0 included; an `argparse` type."""
-    return 0.0 if text.strip() in {"0", "0.0"} else seconds(text)
-
-
-def seconds(text: str) -> float:
-    """Read a positive number of seconds; an `argparse` type."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is no number of seconds above zero")
-    return value
-
-
-def one_entity(text: str) -> Entity:
-    """Read the name of one entity; an `argparse` type."""
-    try:
-        return Entity(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
-
-
-def whole(text: str) -> int:
-    """Read a whole number above zero; an `argparse` type."""
-    if not text.isdecimal() or not int(text):
-        raise argparse.ArgumentTypeError(f"{text!r} is no whole number above zero")
-    return int(text)
-
-
-def endpoints(text: str) -> str:
-    """Check endpoints, comma separated, or none; an `argparse` type."""
-    from enact_dist.config.types import checked_endpoint
-
-    for endpoint in text.split(","):
-        if endpoint.strip():
-            _checked(checked_endpoint, endpoint.strip())
-    return text
-
-
-def address(text: str) -> str:
-    """Check where metrics are to be served, or nothing; an `argparse` type."""
-    from enact_dist.config.types import metrics_address
-
-    if text:
-        _checked(metrics_address, text)
-    return text
-
-
-def _checked(check: Callable[[str], object], text: str) -> None:
-    try:
-        check(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
-
-
-def entities(text: str) -> str:
-    """Read a pattern of entities; an `argparse` type."""
-    try:
-        return str(Entities(text))
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
-
-
-def world_name(text: str) -> str:
-    """Check the name of a world context that is to be made; an `argparse` type."""
-    try:
-        checked_name("world context", text, slashes=False)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
-    return text
-
-
-def pair(text: str) -> tuple[str, str]:
-    """Read ``name=value``; an `argparse` type."""
-    name, equals, value = text.partition("=")
-    if not equals or not name:
-        raise argparse.ArgumentTypeError(f"{text!r} is not written name=value")
-    return name, value
-
-
-def pairs(found: list[tuple[str, str]] | None, option: str) -> dict[str, str]:
-    """Return repeated ``name=value`` options as a dict; a name given twice is refused.
-
-    Raises:
-        ConfigError: A name is given twice.
+    Attributes:
+        facts: For programs: `--json` prints them.  What takes long to make may be a function.
+        text: For people: lines, or a function that prints them.
+        rows: For people: the rows of the verb's table, which stands above the text.
+        status: Exit status.
     """
-    read: dict[str, str] = {}
-    for name, value in found or ():
-        if name in read:
-            raise ConfigError(f"{option} {name} is given twice: {read[name]!r} and {value!r}")
-        read[name] = value
-    return read
+
+    facts: object
+    text: str | Callable[[], None] = ""
+    rows: Sequence[Sequence[object]] | None = None
+    status: int = DONE
 
 
-def slot_parts(text: str) -> tuple[str, str]:
-    """Read ``ENTITY/ASPECT``, split at the last slash, whatever the two are."""
-    entity, slash, aspect = text.rpartition("/")
-    if not slash or not entity or not aspect:
-        raise argparse.ArgumentTypeError(f"{text!r} is not written ENTITY/ASPECT")
-    return entity, aspect
+def run_verb(options: argparse.Namespace) -> int:
+    """Carry out the verb that the options name; print its output; return the exit status."""
+    verb: Verb = options.verb
+    function = function_of(options.noun, verb)
+    if verb.cell:
+        from enact_dist.cli.target import open_cell
+
+        with open_cell(options, observer=verb.cell == LOOKS) as cell:
+            answer = function(cell, options)
+    else:
+        answer = function(options)
+    if isinstance(answer, int):
+        return answer
+    _print(answer, verb, as_json=getattr(options, "json", False))
+    return answer.status
 
 
-def slot_name(text: str) -> tuple[str, str]:
-    """Read ``ENTITY/ASPECT``, two names and no pattern; an `argparse` type."""
-    entity, aspect = slot_parts(text)
-    try:
-        checked_name("entity", entity, slashes=True)
-        checked_name("aspect", aspect, slashes=False)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
-    return entity, aspect
+def _print(answer: Output, verb: Verb, *, as_json: bool) -> None:
+    from enact_dist.cli.text.output import print_json, print_table
 
-
-def slot_version(text: str) -> tuple[str, str, int]:
-    """Read ``ENTITY/ASPECT[@VERSION]``, version 0 if none is named; an `argparse` type."""
-    name, at, number = text.partition("@")
-    slot = slot_name(name)
-    if at and not (number.isdecimal() and int(number)):
-        raise argparse.ArgumentTypeError(f"{text!r} does not name a version as @12")
-    return *slot, int(number or 0)
-
-
-# ---------------------------------------------------------------- the cell
-
-
-def cell_target(arguments: argparse.Namespace) -> str:
-    """Return the `cell.toml` or endpoint that the command names.
-
-    Raises:
-        ConfigError: None is named and none lies here.
-    """
-    named = arguments.cell or os.environ.get(CELL_VARIABLE)
-    if named:
-        return str(named)
-    if not Path(CELL_DEFAULT).is_file():
-        raise ConfigError(
-            f"no cell: there is no {CELL_DEFAULT} in {Path.cwd()}; name one with --cell FILE or"
-            f" --cell tcp/host:7447, or set {CELL_VARIABLE}"
-        )
-    return CELL_DEFAULT
-
-
-def is_endpoint(target: str) -> bool:
-    """Say whether a cell is named by an endpoint instead of a file."""
-    protocol, slash, address = target.partition("/")
-    return bool(slash) and protocol in {"tcp", "tls", "quic", "udp", "ws"} and ":" in address
-
-
-def cell_config(arguments: argparse.Namespace) -> CellConfig:
-    """Return the configuration of the cell that the command names.
-
-    Raises:
-        ConfigError: It names an endpoint, or the file cannot be used.
-    """
-    from enact_dist.config.read import load_config
-
-    target = cell_target(arguments)
-    if is_endpoint(target):
-        raise ConfigError(f"{target} is an endpoint; this command needs the cell.toml: --cell FILE")
-    return load_config(target)
+    if as_json:
+        print_json(answer.facts() if callable(answer.facts) else answer.facts)
+        return
+    if answer.rows is not None:
+        print_table(verb.columns, answer.rows, empty=verb.empty)
+    if callable(answer.text):
+        answer.text()
+    elif answer.text:
+        print(answer.text)
 
 
 def exit_status(error: Exception) -> int:
@@ -334,46 +305,3 @@ def exit_status(error: Exception) -> int:
 def told(error: Exception) -> str:
     """Return what a command says of an error that has ended it: one line."""
     return shown(" ".join((str(error) or type(error).__name__).split()))
-
-
-def open_cell(arguments: argparse.Namespace, *, observer: bool = True, actor: str = "") -> Cell:
-    """Join the cell that the command names.
-
-    Args:
-        arguments: Of a verb with the option `--cell`.
-        observer: Only look.
-        actor: How others see this process; `enact` unless given.
-
-    Raises:
-        ConfigError: The cell is named wrongly.
-        ShardUnreachableError: No shard answered in time.
-    """
-    from enact_dist.world.connecting import connect
-
-    timeout_s = getattr(arguments, "timeout_s", TIMEOUT_S)
-    return connect(
-        cell_target(arguments),
-        actor=actor or "enact",
-        timeout_s=timeout_s,
-        request_timeout_s=timeout_s,
-        observer=observer,
-    )
-
-
-def see_modules(cell_file: Path | None = None, *, runs_cell: bool = True) -> None:
-    """Let ``MODULE:CLASS`` name a module beside the cell.toml, or of the working folder.
-
-    The folder of a cell.toml whose program is to run comes first.  Any other folder comes last:
-    no file in it hides an installed module.
-
-    Args:
-        cell_file: The cell.toml, if there is one.
-        runs_cell: Whether the command runs the cell's program, and does not only look at the cell.
-    """
-    folders = [os.getcwd()]  # noqa: PTH109 (sys.path holds text)
-    if cell_file is not None:
-        beside = str(cell_file.absolute().parent)
-        if runs_cell and sys.path[:1] != [beside]:
-            sys.path.insert(0, beside)
-        folders.insert(0, beside)
-    sys.path.extend(folder for folder in dict.fromkeys(folders) if folder not in sys.path)

@@ -7,14 +7,14 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from enact_dist.cli.arguments import counted, file_of
 from enact_dist.cli.text.output import ProgressLine, print_json, print_table
-from enact_dist.cli.verbs import DONE, FAILED, add_noun, add_verb, verbs_of, whole
+from enact_dist.cli.verbs import DONE, FAILED, OptionGroup, Verb, flag, option
 from enact_dist.errors import ConfigError, EnactError
 
 if TYPE_CHECKING:
     from actors.geometry.charuco import Board
     from actors.workcell.calibrate import CalibrateReport
-    from enact_dist.cli.verbs import Verb
 
 BOARD: Final = "8x11,0.024,0.018,4X4_50"
 """Fits on A4."""
@@ -22,76 +22,6 @@ _EXTRA: Final = ("cv2", "scipy")
 _COLUMNS: Final = (
     "CAMERA", "PICTURES", "BOARD", "SHARED", "COVERED", "FOCAL PX", "RMS PX", "X, Y, Z M",
 )  # fmt: skip
-
-
-def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
-    """Add the noun and its verbs."""
-    verbs = verbs_of(add_noun(nouns, "workcell"))
-    verb = add_verb(
-        verbs,
-        "calibrate",
-        "lenses and poses of cameras from pictures of a ChArUco board",
-        run=run_calibrate,
-        example="enact workcell calibrate --print-board board.pdf\n"
-        "enact workcell calibrate pictures --origin 000\n"
-        "enact workcell calibrate pictures --board 7x5,0.08,0.06,5X5_100 --json\n"
-        "enact workcell calibrate pictures --from 'v4l2:/dev/video0?size=640x480' --shots 20\n"
-        "enact demo workcell --cameras pictures",
-    )
-    verb.add_argument(
-        "folder",
-        type=Path,
-        nargs="?",
-        metavar="FOLDER",
-        help="holds images/CAMERA/MOMENT.png; pictures of one MOMENT show the board in one place",
-    )
-    verb.add_argument(
-        "--board",
-        default=BOARD,
-        metavar="B",
-        help="COLUMNSxROWS,SQUARE_M,MARKER_M,DICTIONARY[,legacy] as it was printed (default:"
-        f" {BOARD}, which fits on A4)",
-    )
-    verb.add_argument(
-        "--print-board", type=Path, metavar="FILE", help="write it to print: .pdf, .svg or .png"
-    )
-    verb.add_argument(
-        "--out", type=Path, metavar="FILE", help="what is written (default: FOLDER/cameras.json)"
-    )
-    verb.add_argument(
-        "--origin",
-        default="",
-        metavar="MOMENT",
-        help="the board lay at the cell's origin then: its lower left corner, x right, y up the"
-        " sheet, z out of it (default: a moment at which most cameras saw it)",
-    )
-    verb.add_argument(
-        "--board-at",
-        type=place,
-        default=(0.0, 0.0, 0.0, 0.0),
-        metavar="X,Y,Z,TURN",
-        help="where it lay then instead, face up: metres, and degrees about z",
-    )
-    verb.add_argument(
-        "--intrinsics",
-        type=Path,
-        metavar="DIR",
-        help="keep the lenses of a calibration in that folder, and seek poses only",
-    )
-    verb.add_argument("--k3", action="store_true", help="fit k3, too: wide lenses need it")
-    verb.add_argument("--json", action="store_true", help="print the report as JSON")
-    live = verb.add_argument_group("pictures by cameras that are connected")
-    live.add_argument(
-        "--from",
-        dest="sources",
-        nargs="+",
-        metavar="ADDRESS",
-        help="take them into FOLDER first, whenever the board lies still in a new place; the"
-        " cameras are named 0, 1, 2 … in this order",
-    )
-    live.add_argument(
-        "--shots", type=whole, default=30, metavar="N", help="at how many places (default 30)"
-    )
 
 
 def place(text: str) -> tuple[float, float, float, float]:
@@ -103,10 +33,51 @@ def place(text: str) -> tuple[float, float, float, float]:
     return x_m, y_m, z_m, turn_deg
 
 
-def run_calibrate(arguments: argparse.Namespace) -> int:
+VERBS: Final = (
+    Verb(
+        "calibrate", "find the lenses and poses of cameras from pictures of a ChArUco board",
+        "run_calibrate",
+        "enact workcell calibrate --print-board board.pdf\n"
+        "enact workcell calibrate pictures --origin 000\n"
+        "enact workcell calibrate pictures --board 7x5,0.08,0.06,5X5_100 --json\n"
+        "enact workcell calibrate pictures --from 'v4l2:/dev/video0?size=640x480' --shots 20\n"
+        "enact demo workcell --cameras pictures",
+        (
+            file_of("folder", "FOLDER",
+                    "holds images/CAMERA/MOMENT.png; pictures of one MOMENT show the board in one"
+                    " place", nargs="?"),
+            option("--board", "B",
+                   "COLUMNSxROWS,SQUARE_M,MARKER_M,DICTIONARY[,legacy] as it was printed (default:"
+                   f" {BOARD}, which fits on A4)", default=BOARD),
+            file_of("--print-board", "FILE", "write the board for printing: .pdf, .svg or .png"),
+            file_of("--out", "FILE", "file of the calibration (default: FOLDER/cameras.json)"),
+            option("--origin", "MOMENT",
+                   "the board lay at the cell's origin then: its lower left corner, x right, y up"
+                   " the sheet, z out of it (default: a moment at which most cameras saw it)",
+                   default=""),
+            option("--board-at", "X,Y,Z,TURN",
+                   "where it lay then instead, face up: metres, and degrees about z",
+                   type=place, default=(0.0, 0.0, 0.0, 0.0)),
+            file_of("--intrinsics", "DIR",
+                    "keep the lenses of a calibration in that folder, and seek poses only"),
+            flag("--k3", "fit k3, too: wide lenses need it"),
+            flag("--json", "print the report as JSON"),
+            OptionGroup("pictures by cameras that are connected", (
+                option("--from", "ADDRESS",
+                       "take them into FOLDER first, whenever the board lies still in a new place;"
+                       " the cameras are named 0, 1, 2 … in this order", dest="sources",
+                       nargs="+"),
+                counted("--shots", "at how many places (default 30)", 30),
+            )),
+        ),
+    ),
+)  # fmt: skip
+
+
+def run_calibrate(options: argparse.Namespace) -> int:
     """Print a board, or calibrate cameras: what the options ask for."""
     try:
-        return _calibrate(arguments)
+        return _calibrate(options)
     except ImportError as error:
         if (error.name or "").partition(".")[0] in _EXTRA:
             raise ConfigError(
@@ -116,29 +87,29 @@ def run_calibrate(arguments: argparse.Namespace) -> int:
         raise
 
 
-def _calibrate(arguments: argparse.Namespace) -> int:
+def _calibrate(options: argparse.Namespace) -> int:
     from actors.geometry.charuco import board_of
     from actors.geometry.files import InputFileError
 
     try:
-        board = board_of(arguments.board)
+        board = board_of(options.board)
     except ValueError as error:
         raise ConfigError(f"--board: {error}") from None
-    if arguments.print_board:
-        return _print_board(board, arguments)
-    folder: Path | None = arguments.folder
+    if options.print_board:
+        return _print_board(board, options)
+    folder: Path | None = options.folder
     if folder is None:
         raise ConfigError("name the folder of the pictures, or --print-board FILE")
     line = ProgressLine()
     try:
-        if arguments.sources:
-            _take(folder, board, arguments, line)
-        report = _report_of(folder, board, arguments, line)
+        if options.sources:
+            _take(folder, board, options, line)
+        report = _report_of(folder, board, options, line)
     except InputFileError as error:
         line.end()
         print(f"enact workcell: {error}", file=sys.stderr)
         return FAILED
-    if arguments.json:
+    if options.json:
         print_json(report)
     else:
         _print(report)
@@ -147,7 +118,7 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     return FAILED if report.left_out else DONE
 
 
-def _take(folder: Path, board: Board, arguments: argparse.Namespace, line: ProgressLine) -> None:
+def _take(folder: Path, board: Board, options: argparse.Namespace, line: ProgressLine) -> None:
     """Take pictures of the board.
 
     Raises:
@@ -157,8 +128,8 @@ def _take(folder: Path, board: Board, arguments: argparse.Namespace, line: Progr
     from actors.workcell.sources import CameraError
 
     try:
-        with opened_sources(arguments.sources) as sources:
-            take_shots(folder, sources, board, arguments.shots, tell=line.show)
+        with opened_sources(options.sources) as sources:
+            take_shots(folder, sources, board, options.shots, tell=line.show)
     except CameraError as error:
         raise EnactError(str(error)) from error
     finally:
@@ -166,17 +137,17 @@ def _take(folder: Path, board: Board, arguments: argparse.Namespace, line: Progr
 
 
 def _report_of(
-    folder: Path, board: Board, arguments: argparse.Namespace, line: ProgressLine
+    folder: Path, board: Board, options: argparse.Namespace, line: ProgressLine
 ) -> CalibrateReport:
     from actors.workcell.calibrate import FILE, CalibrateOptions, calibrate
 
-    options = CalibrateOptions(
+    wanted = CalibrateOptions(
         board,
-        arguments.out or folder / FILE,
-        origin=arguments.origin,
-        board_at=arguments.board_at,
-        intrinsics=arguments.intrinsics,
-        k3=arguments.k3,
+        options.out or folder / FILE,
+        origin=options.origin,
+        board_at=options.board_at,
+        intrinsics=options.intrinsics,
+        k3=options.k3,
     )
 
     def progress(done: int, total: int) -> None:
@@ -184,17 +155,17 @@ def _report_of(
         if done == total:
             line.show("fitting lenses and poses", at_once=True)
 
-    report = calibrate(folder, options, progress=progress)
+    report = calibrate(folder, wanted, progress=progress)
     line.end()
     return report
 
 
-def _print_board(board: Board, arguments: argparse.Namespace) -> int:
+def _print_board(board: Board, options: argparse.Namespace) -> int:
     from actors.geometry.board_sheet import KINDS, MARGIN_M, sheet
     from actors.geometry.files import check_output, write_whole
 
-    file: Path = arguments.print_board
-    if arguments.folder is not None:
+    file: Path = options.print_board
+    if options.folder is not None:
         raise ConfigError("--print-board writes a board and ends; leave out FOLDER")
     if file.suffix.lower() not in KINDS:
         raise ConfigError(f"--print-board {file}: name a file that ends in {', '.join(KINDS)}")

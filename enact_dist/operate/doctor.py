@@ -20,7 +20,15 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.core.state.clock import is_kept, state_of
 from enact_dist.errors import ConfigError, EnactError, ShardUnreachableError
 from enact_dist.link.memory.shared_folder import MEMORY, SHARED_FOLDER_VARIABLE
-from enact_dist.operate.doctor_cell import Finding, Level
+from enact_dist.operate.doctor_cell import (
+    Finding,
+    differences,
+    duplicate_daemons,
+    fail,
+    folders,
+    ok,
+    warn,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterator
@@ -65,25 +73,18 @@ def examine(target: str, *, timeout_s: float = 5.0) -> Iterator[Finding]:
     named = os.environ.get(SHARED_FOLDER_VARIABLE)
     yield shared_memory(Path(named) if named else MEMORY, named=bool(named))
     if not target:
-        yield Finding(
-            Level.WARN,
-            "cell",
-            "not checked: no cell.toml here",
-            "name it: enact doctor --cell FILE",
-        )
+        yield warn("cell", "not checked: no cell.toml here", "name it: enact doctor --cell FILE")
         return
     config = None
     if Path(target).suffix == ".toml" or Path(target).exists():
         try:
             config = _config(target)
         except ConfigError as error:
-            yield Finding(Level.FAIL, "cell.toml", str(error), "correct the file")
+            yield fail("cell.toml", str(error), "correct the file")
             return
-        yield Finding(Level.OK, "cell.toml", f"{target}: cell {config.name}, {_counts(config)}")
+        yield ok("cell.toml", f"{target}: cell {config.name}, {_counts(config)}")
     kept = yield from _cell(target, config, timeout_s)
     if config is not None:
-        from enact_dist.operate.doctor_cell import folders
-
         yield from folders(config, kept)
 
 
@@ -107,8 +108,8 @@ def python_version(found: tuple[int, ...]) -> Finding:
     """Check a version of Python."""
     shown = ".".join(map(str, found))
     if found[:2] >= PYTHON_MIN:
-        return Finding(Level.OK, "python", f"{shown} at {sys.executable}")
-    return Finding(Level.FAIL, "python", f"{shown} is older than 3.11", "install a newer python3")
+        return ok("python", f"{shown} at {sys.executable}")
+    return fail("python", f"{shown} is older than 3.11", "install a newer python3")
 
 
 def _packages() -> Iterator[Finding]:
@@ -116,11 +117,9 @@ def _packages() -> Iterator[Finding]:
         try:
             importlib.import_module(name)
         except ImportError as error:
-            yield Finding(
-                Level.FAIL, name, f"cannot be imported: {error}", f"pip install {package}"
-            )
+            yield fail(name, f"cannot be imported: {error}", f"pip install {package}")
         else:
-            yield Finding(Level.OK, name, _version(package))
+            yield ok(name, _version(package))
 
 
 def _version(package: str) -> str:
@@ -134,8 +133,7 @@ def _version(package: str) -> str:
 
 def _open3d() -> Iterator[Finding]:
     if importlib.util.find_spec("open3d") is None:
-        yield Finding(
-            Level.WARN,
+        yield warn(
             "open3d",
             "not installed; the core does without, the demo does not",
             "pip install -e '.[actors]' in the clone of enact-dist",
@@ -143,8 +141,7 @@ def _open3d() -> Iterator[Finding]:
         return
     missing = missing_libraries(LIBRARIES)
     if missing:
-        yield Finding(
-            Level.FAIL,
+        yield fail(
             "open3d",
             f"cannot load {', '.join(missing)}",
             f"sudo apt-get install -y {' '.join(missing.values())}",
@@ -172,11 +169,11 @@ def _open3d_import() -> Finding:
     )
     if done.returncode == 0:
         version = done.stdout.strip().splitlines()[-1]
-        return Finding(Level.OK, "open3d", f"{version}, all shared libraries found")
+        return ok("open3d", f"{version}, all shared libraries found")
     last = (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]
     found = re.search(r"(\S+\.so[.\d]*): cannot open shared object", last)
     remedy = f"apt-file search {found[1]} names the package" if found else "reinstall open3d-cpu"
-    return Finding(Level.FAIL, "open3d", f"cannot be imported: {last}", remedy)
+    return fail("open3d", f"cannot be imported: {last}", remedy)
 
 
 def shared_memory(folder: Path, *, named: bool = False) -> Finding:
@@ -189,21 +186,19 @@ def shared_memory(folder: Path, *, named: bool = False) -> Finding:
     if named and not os.path.lexists(folder):
         folder = next(parent for parent in folder.absolute().parents if parent.is_dir())
     if not folder.is_dir():
-        return Finding(
-            Level.WARN, "shared memory", f"{folder} is no folder", f"mount a tmpfs at {folder}"
-        )
+        return warn("shared memory", f"{folder} is no folder", f"mount a tmpfs at {folder}")
     if not os.access(folder, os.W_OK | os.X_OK):
         remedy = f"sudo chmod 1777 {folder}"
         if named:
             remedy = f"let this user write there, or name another in {SHARED_FOLDER_VARIABLE}"
-        return Finding(Level.WARN, "shared memory", f"{folder} is not writable", remedy)
+        return warn("shared memory", f"{folder} is not writable", remedy)
     usage = shutil.disk_usage(folder)
     text = f"{folder}: {usage.free / 1e6:.0f} MB free of {usage.total / 1e6:.0f} MB"
     if usage.free < SHM_BYTES_WARN:
         how = "of a container: the tmpfs volume" if named else "docker run --shm-size=1g"
         remedy = f"enlarge it: mount -o remount,size=1G {folder} ({how})"
-        return Finding(Level.WARN, "shared memory", text, remedy)
-    return Finding(Level.OK, "shared memory", text)
+        return warn("shared memory", text, remedy)
+    return ok("shared memory", text)
 
 
 # ---------------------------------------------------------------- the cell
@@ -213,7 +208,6 @@ def _cell(
     target: str, config: CellConfig | None, timeout_s: float
 ) -> Generator[Finding, None, frozenset[str]]:
     """Check the cell; return the names of the shards that keep data in a folder now."""
-    from enact_dist.operate.doctor_cell import differences, duplicate_daemons
     from enact_dist.world.connecting import connect
 
     kept: frozenset[str] = frozenset()
@@ -232,9 +226,9 @@ def _cell(
             return kept
         for known in config.shards:
             yield _unreachable(f"shard {known.name}", known.advertise[0])
-        yield Finding(Level.FAIL, "cell", str(error), f"enact up {target}")
+        yield fail("cell", str(error), f"enact up {target}")
     except EnactError as error:
-        yield Finding(Level.FAIL, "cell", f"{type(error).__name__}: {error}")
+        yield fail("cell", f"{type(error).__name__}: {error}")
     return kept
 
 
@@ -257,7 +251,7 @@ def _best_rounds(cell: Cell) -> list[ShardInfo]:
 def _shard(shard: ShardInfo) -> Iterator[Finding]:
     subject = f"shard {shard.name}"
     if shard.problem:
-        yield Finding(Level.FAIL, subject, f"{shard.endpoint}: {shard.problem}")
+        yield fail(subject, f"{shard.endpoint}: {shard.problem}")
         return
     if not shard.reachable:
         yield _unreachable(subject, shard.endpoint)
@@ -267,20 +261,18 @@ def _shard(shard: ShardInfo) -> Iterator[Finding]:
     yield from shared_data(shard)
     stalls = shard.counters.get("disk_stalls", 0)
     if stalls:
-        yield Finding(
-            Level.WARN,
+        yield warn(
             f"disk of {shard.name}",
             f"stood still for more than a second {stalls} times since the shard started",
             "see the shard's log for when; move its folder to another disk, or what else uses this",
         )
     alarms = shard.counters.get("alarms", 0)
     if alarms:
-        yield Finding(
-            Level.FAIL,
+        yield fail(
             f"commits on {shard.name}",
             f"{alarms} locks that were aborted by hand had been committed elsewhere: they stand"
             " only in part",
-            "read enact lock audit, mend the data, then enact lock audit --settle TEXT"
+            "read enact lock audit, mend the data, then enact lock audit --acknowledge TEXT"
             f" --shard {shard.name}",
         )
 
@@ -294,21 +286,19 @@ def shared_data(shard: ShardInfo) -> Iterator[Finding]:
         if "payload_bytes_max" in counters:
             found = "none: its large data travel, on its own host too"
             remedy = "its log says why, unless shared_bytes_max = 0 asks for it"
-            yield Finding(Level.WARN, subject, found, remedy)
+            yield warn(subject, found, remedy)
         return
     text = f"{counters.get('payload_files', 0)} files, {used} of {most} bytes"
     refused = counters.get("payloads_refused", 0)
     fell_back = counters.get("payload_fallbacks", 0)
     if refused:
         remedy = "raise shared_bytes_max in cell.toml, or retain fewer versions"
-        yield Finding(Level.WARN, subject, f"{text}; {refused} writes were refused", remedy)
+        yield warn(subject, f"{text}; {refused} writes were refused", remedy)
     elif fell_back:
         remedy = "enlarge the file system of the shared folder (in a container: a tmpfs volume)"
-        yield Finding(
-            Level.WARN, subject, f"{text}; {fell_back} large data did not fit and travel", remedy
-        )
+        yield warn(subject, f"{text}; {fell_back} large data did not fit and travel", remedy)
     elif used:
-        yield Finding(Level.OK, subject, text)
+        yield ok(subject, text)
 
 
 def _connection(subject: str, shard: ShardInfo) -> Finding:
@@ -318,8 +308,8 @@ def _connection(subject: str, shard: ShardInfo) -> Finding:
     text = f"{shard.endpoint} answers in {took}{state}"
     if shard.round_trip_s > ROUND_TRIP_S_WARN:
         remedy = "every lock takes two round trips: look for a busy host or a slow link"
-        return Finding(Level.WARN, subject, text, remedy)
-    return Finding(Level.OK, subject, text)
+        return warn(subject, text, remedy)
+    return ok(subject, text)
 
 
 def clock_skew(subject: str, ahead_s: float) -> Finding:
@@ -327,15 +317,15 @@ def clock_skew(subject: str, ahead_s: float) -> Finding:
     text = f"{abs(ahead_s) * 1e3:.1f} ms {'ahead of' if ahead_s > 0 else 'behind'} this host"
     remedy = "synchronise both hosts' clocks: sudo apt-get install -y chrony"
     if abs(ahead_s) > SKEW_S_FAIL:
-        return Finding(Level.FAIL, subject, f"{text}; commits would be refused", remedy)
+        return fail(subject, f"{text}; commits would be refused", remedy)
     if abs(ahead_s) > SKEW_S_WARN:
-        return Finding(Level.WARN, subject, text, remedy)
-    return Finding(Level.OK, subject, text)
+        return warn(subject, text, remedy)
+    return ok(subject, text)
 
 
 def _unreachable(subject: str, endpoint: str) -> Finding:
     found, remedy = knock(endpoint)
-    return Finding(Level.FAIL, subject, f"{endpoint} does not answer: {found}", remedy)
+    return fail(subject, f"{endpoint} does not answer: {found}", remedy)
 
 
 def knock(endpoint: str, *, timeout_s: float = 2.0) -> tuple[str, str]:

@@ -60,6 +60,21 @@ class Finding:
     remedy: str = ""
 
 
+def ok(subject: str, text: str) -> Finding:
+    """Return a finding that asks for nothing."""
+    return Finding(Level.OK, subject, text)
+
+
+def warn(subject: str, text: str, remedy: str) -> Finding:
+    """Return a finding that may become a problem."""
+    return Finding(Level.WARN, subject, text, remedy)
+
+
+def fail(subject: str, text: str, remedy: str = "") -> Finding:
+    """Return a finding with which the cell does not work."""
+    return Finding(Level.FAIL, subject, text, remedy)
+
+
 def differences(
     config: CellConfig | None, shards: Iterable[ShardInfo], welcomes: Mapping[str, Welcome]
 ) -> Iterator[Finding]:
@@ -74,8 +89,7 @@ def differences(
     versions = {placement.version: name for name, placement in placements.items()}
     if len(versions) > 1:
         first, other = list(versions.values())[:2]
-        yield Finding(
-            Level.FAIL,
+        yield fail(
             "placement",
             f"{first} and {other} were started with different shards or pins: {_shown(placements)}",
             "start all shards with the same cell.toml",
@@ -118,7 +132,7 @@ def duplicate_daemons(
         found = serving(cell, shard, endpoints, timeout_s=ASK_S) if len(endpoints) > 1 else ()
         if len(found) > 1:
             wrong, _, remedy = two_daemons(cell, shard, found).partition("; ")
-            yield Finding(Level.FAIL, f"shard {shard}", wrong, remedy)
+            yield fail(f"shard {shard}", wrong, remedy)
 
 
 def folders(config: CellConfig, kept: Collection[str]) -> Iterator[Finding]:
@@ -136,14 +150,13 @@ def folders(config: CellConfig, kept: Collection[str]) -> Iterator[Finding]:
                 yield _without_folder(shard.name)
         elif running and not os.access(folder, os.W_OK | os.X_OK):
             text = f"{folder} is on another machine or another user's, where the shard runs"
-            yield Finding(Level.OK, f"disk of {shard.name}", text)
+            yield ok(f"disk of {shard.name}", text)
         elif shard.host in {"", host}:
             yield data_folder(shard.name, folder)
 
 
 def _without_folder(shard: str) -> Finding:
-    return Finding(
-        Level.WARN,
+    return warn(
         f"disk of {shard}",
         "no folder: everything is lost when the shard stops",
         f"write data_folder, or a folder in [shards.{shard}]",
@@ -158,8 +171,7 @@ def data_folder(shard: str, folder: Path) -> Finding:
         there = there.parent
     if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
         user = os.environ.get("USER", str(os.getuid()))
-        return Finding(
-            Level.FAIL,
+        return fail(
             subject,
             f"{there} cannot be written by {user}",
             f"if shard {shard} is to run here, as {user}: sudo install -d -o {user} {folder}",
@@ -167,10 +179,10 @@ def data_folder(shard: str, folder: Path) -> Finding:
     free = shutil.disk_usage(there).free
     text = f"{folder}: {free / 1e9:.1f} GB free"
     if free < DISK_BYTES_FAIL:
-        return Finding(Level.FAIL, subject, text, "free some space: a full disk stops the shard")
+        return fail(subject, text, "free some space: a full disk stops the shard")
     if free < DISK_BYTES_WARN:
-        return Finding(Level.WARN, subject, text, "free some space: a full disk stops the shard")
-    return Finding(Level.OK, subject, text)
+        return warn(subject, text, "free some space: a full disk stops the shard")
+    return ok(subject, text)
 
 
 def _placement(config: CellConfig, running: PlacementMap) -> Iterator[Finding]:
@@ -184,23 +196,21 @@ def _placement(config: CellConfig, running: PlacementMap) -> Iterator[Finding]:
         text = f"shards {', '.join(wanted)}; the running cell has {', '.join(names)}"
     else:
         text = f"{_pins(ours)}; the running cell has {_pins(running)}"
-    yield Finding(Level.WARN, "cell.toml and cell", f"the file has {text}", _RESTART)
+    yield warn("cell.toml and cell", f"the file has {text}", _RESTART)
 
 
 def _folder(shard: ShardConfig, *, kept: bool) -> Iterator[Finding]:
     """Compare whether a shard keeps what is committed."""
     subject = f"disk of {shard.name}"
     if shard.folder is None and kept:
-        yield Finding(
-            Level.WARN,
+        yield warn(
             subject,
             "the running shard keeps its data in a folder, this file names none: started with it,"
             " the shard would begin empty",
             f"write the folder into [shards.{shard.name}], or data_folder for all",
         )
     elif shard.folder is not None and not kept:
-        yield Finding(
-            Level.WARN,
+        yield warn(
             subject,
             f"the running shard has no folder, though this file names {shard.folder}: everything"
             " is lost when it stops",
@@ -213,8 +223,7 @@ def _catalogue(config: CellConfig, welcomes: Mapping[str, Welcome]) -> Iterator[
     for name, welcome in welcomes.items():
         lacking = [world for world in config.worlds if world not in welcome.worlds]
         if lacking:
-            yield Finding(
-                Level.WARN,
+            yield warn(
                 f"cell.toml and {name}",
                 f"the shard has no world context {', '.join(lacking)} of this file",
                 "restart it with this file, or: "
@@ -224,8 +233,7 @@ def _catalogue(config: CellConfig, welcomes: Mapping[str, Welcome]) -> Iterator[
         for aspect in config.aspects:
             asked = aspect.durability.value if aspect.durability is not None else ""
             if asked and known.get(aspect.name, asked) != asked:
-                yield Finding(
-                    Level.WARN,
+                yield warn(
                     f"cell.toml and {name}",
                     f"aspect {aspect.name} is {known[aspect.name]} there and {asked} in this file",
                     "start all shards with the same cell.toml",

@@ -88,9 +88,9 @@ def test_impact_names_what_came_of_a_datum(ask):
     ]
 
 
-def test_kept_tree_is_listed_under_its_label(ask, cell):
-    """`--keep` takes every version of the tree; `enact world kept` shows them."""
-    assert ask("why", "online", "system/sum@1", "--keep", "incident").status == 0
+def test_pinned_tree_is_listed_under_its_label(ask, cell):
+    """`--pin` takes every version of the tree; `enact world pinned` shows them."""
+    assert ask("why", "online", "system/sum@1", "--pin", "incident").status == 0
 
     kept = cell.pinned()["incident"]
     cell.unpin("incident")

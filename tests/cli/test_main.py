@@ -3,10 +3,14 @@
 import argparse
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from enact_dist.cli.main import build_parser, main
+from enact_dist.cli.verbs import NOUNS, function_of, renamed, table_of
+
+PAGES = Path(__file__).parents[2] / "enact_dist" / "docs"
 
 
 def walk_verbs(parser, words=()):
@@ -65,7 +69,8 @@ def test_help_of_up_names_the_variable_that_it_goes_by(capsys, enact, monkeypatc
     [
         (w, line)
         for w, p in walk_verbs(build_parser())
-        for line in (p.epilog or "").splitlines()[1:]
+        for line in (p.epilog or "").splitlines()
+        if line.startswith("  ")
     ],
 )
 def test_examples_of_the_help_can_be_parsed(words, example):
@@ -76,6 +81,44 @@ def test_examples_of_the_help_can_be_parsed(words, example):
     line = line[: line.index("--")] if "--" in line else line
 
     assert isinstance(build_parser().parse_args(line), argparse.Namespace)
+
+
+@pytest.mark.parametrize("noun", NOUNS)
+def test_every_verb_of_a_table_names_its_function_and_a_page(noun):
+    """A table names both by words, which no type checker follows."""
+    assert (PAGES / f"{NOUNS[noun].page}.md").exists()
+    for verb in table_of(noun):
+        assert callable(function_of(noun, verb))
+        assert (PAGES / f"{verb.page or NOUNS[noun].page}.md").exists()
+
+
+@pytest.mark.parametrize(
+    ("former", "now"),
+    [
+        ("world keep --help", "world pin"),
+        ("world kept --help", "world pinned"),
+        ("world let-go --help", "world unpin"),
+        ("why online a/b --keep=incident --help", "why --pin"),
+        ("lock audit --settle text --help", "lock --acknowledge"),
+    ],
+)
+def test_former_name_works_and_names_its_successor(former, now, capsys):
+    """One line on standard error, so that output that a program reads stays the same."""
+    with pytest.raises(SystemExit) as ended:
+        main(former.split())
+
+    out, err = capsys.readouterr()
+    assert ended.value.code == 0
+    assert out.startswith(f"usage: enact {now.partition(' --')[0]}")
+    assert f"is now called enact {now};" in err
+    assert err.count("\n") == 1
+
+
+def test_former_names_stand_in_no_help():
+    """Nor in the list that a wrong verb gets; as values they stay what they are."""
+    shown = [parser.format_help() for _, parser in walk_verbs(build_parser())]
+    assert not any(f" {name} " in text for text in shown for name in ("let-go", "--settle"))
+    assert renamed("world", ["world", "create", "keep"]) == (["world", "create", "keep"], [])
 
 
 def test_readers_all_have_json():
@@ -123,7 +166,7 @@ def test_wrong_usage_is_told_with_the_usage_of_its_verb(words, capsys):
         ("up --debug cell.toml", {"cell": "cell.toml", "debug": True}),
         ("bench --seconds 3 floor core", {"names": ["floor", "core"]}),
         ("bench floor --seconds 3 core", {"names": ["floor", "core"]}),
-        ("world keep drop-17 online a/b --json c/d", {"slots": [("a", "b", 0), ("c", "d", 0)]}),
+        ("world pin drop-17 online a/b --json c/d", {"slots": [("a", "b", 0), ("c", "d", 0)]}),
     ],
 )
 def test_options_may_stand_anywhere(line, found):
@@ -172,7 +215,7 @@ def test_missing_cell_is_named_with_its_remedies(enact, tmp_path):
     assert result.status == 2
     assert result.err == (
         f"enact: no cell: there is no cell.toml in {tmp_path}; name one with --cell FILE or"
-        " --cell tcp/host:7447, or set ENACT_CELL\n"
+        " --cell tcp/host:7447, or set ENACT_CELL (docs/cell.md explains the file)\n"
     )
 
 

@@ -42,7 +42,7 @@ def test_plain_table_is_aligned(capsys):
 
 def test_table_and_tree_are_drawn_on_a_terminal(capsys, monkeypatch):
     """On a terminal the same content is drawn; brackets in data are no markup."""
-    from enact_dist.cli.text.slots import Branch
+    from enact_dist.cli.text.output import Branch
 
     monkeypatch.setattr(output, "on_terminal", lambda _=None: True)
     root = Branch("online")

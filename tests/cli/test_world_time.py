@@ -1,4 +1,4 @@
-"""`enact world history|at|fork|drop|keep|kept|let-go` against two real shards."""
+"""`enact world history|at|fork|drop|pin|pinned|unpin` against two real shards."""
 
 import json
 from datetime import datetime
@@ -164,37 +164,37 @@ def test_context_of_the_cell_file_is_not_dropped(at):
     assert "stands in cell.toml" in result.err
 
 
-def test_versions_are_kept_listed_and_let_go(at, made):
+def test_versions_are_pinned_listed_and_released(at, made):
     """A version of each datum, the newest unless one is named."""
     label = "drop-17"
 
-    kept = at("keep", label, made.name, "arm/time_count@2", "system/leg/time_count")
+    kept = at("pin", label, made.name, "arm/time_count@2", "system/leg/time_count")
 
     assert kept.out.splitlines() == [
-        f"{made.name}:arm/time_count v2 is kept as {label}",
-        f"{made.name}:system/leg/time_count v1 is kept as {label}",
+        f"{made.name}:arm/time_count v2 is pinned as {label}",
+        f"{made.name}:system/leg/time_count v1 is pinned as {label}",
     ]
-    listed = json.loads(at("kept", "--json").out)
+    listed = json.loads(at("pinned", "--json").out)
     assert [(row["entity"], row["version"]) for row in listed[label]] == [
         ("arm", 2),
         ("system/leg", 1),
     ]
-    head, *rows = at("kept").out.splitlines()
+    head, *rows = at("pinned").out.splitlines()
     assert head.split() == ["label", "datum", "version", "time", "age", "size"]
     assert [row.split()[:3] for row in rows] == [
         [label, f"{made.name}:arm/time_count", "v2"],
         [label, f"{made.name}:system/leg/time_count", "v1"],
     ]
-    assert "kept as drop-17" in at("history", made.name, "arm/time_count").out
-    assert at("let-go", label).out == f"{label}: 2 versions released\n"
-    assert at("kept").out == "no version is kept under a label\n"
-    again = at("let-go", label)
-    assert (again.status, again.out) == (1, f"nothing is kept as {label}; labels: none\n")
+    assert "pinned as drop-17" in at("history", made.name, "arm/time_count").out
+    assert at("unpin", label).out == f"{label}: 2 versions released\n"
+    assert at("pinned").out == "no version is pinned\n"
+    again = at("unpin", label)
+    assert (again.status, again.out) == (1, f"nothing is pinned as {label}; labels: none\n")
 
 
-def test_version_that_is_not_known_is_not_kept(at, made):
+def test_version_that_is_not_known_is_not_pinned(at, made):
     """The known ones are named."""
-    result = at("keep", "label", made.name, "arm/time_count@9")
+    result = at("pin", "label", made.name, "arm/time_count@9")
 
     assert result.status == 1
     assert "has no version 9 that is known; known: v1, v2, v3" in result.err
@@ -224,7 +224,7 @@ def test_names_of_the_past_that_cannot_be_are_usage_errors(at, made, words, said
         (("history", "w", "arm/time_count@2"), "'time_count@2' cannot name an aspect"),
         (("history", "w", "arm/time_count", "--count", "0"), "'0' is no whole number above zero"),
         (("history", "w", "arm/time_count", "--timeout", "x"), "'x' is no number of seconds"),
-        (("keep", "label", "w", "arm//time_count"), "'arm/' cannot name an entity"),
+        (("pin", "label", "w", "arm//time_count"), "'arm/' cannot name an entity"),
     ],
 )
 def test_names_that_cannot_be_are_usage_errors(at, capsys, words, said):
@@ -246,9 +246,9 @@ def test_the_future_is_refused_however_far(at, made, time):
     assert "datetime.datetime" not in done.err
 
 
-def test_to_keep_what_never_was_names_no_version(at, made):
+def test_to_pin_what_never_was_names_no_version(at, made):
     """Version 0 is the command line's word for the newest, nobody's."""
-    done = at("keep", "label", made.name, "nobody/time_count")
+    done = at("pin", "label", made.name, "nobody/time_count")
 
     assert done.status == 1
     assert "nobody/time_count has no version that is known" in done.err

@@ -1,4 +1,4 @@
-"""`enact actor ls|check`; `cli.actor.run` and `cli.actor.tell` have the other verbs of the noun."""
+"""`enact actor ls|check`."""
 
 from __future__ import annotations
 
@@ -7,21 +7,9 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.cli.actor import run as actor_run
-from enact_dist.cli.actor import tell as actor_tell
-from enact_dist.cli.text.output import print_json, print_table, shown_s
-from enact_dist.cli.verbs import (
-    DONE,
-    FAILED,
-    add_cell,
-    add_noun,
-    add_reader,
-    add_verb,
-    cell_config,
-    open_cell,
-    see_modules,
-    verbs_of,
-)
+from enact_dist.cli.target import cell_config, see_modules
+from enact_dist.cli.text.output import print_json, shown_s
+from enact_dist.cli.verbs import DONE, FAILED, Output
 from enact_dist.errors import ConfigError, EnactError, ProtocolError
 
 if TYPE_CHECKING:
@@ -29,71 +17,26 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from enact_dist.actor.report import ActorStatistics
-    from enact_dist.cli.verbs import Verb
     from enact_dist.config.types import CellConfig
+    from enact_dist.world.cell import Cell
     from enact_dist.world.listings import ActorInfo
 
 LOOK_S: Final = 2.0
 """How long a shard may take to say how often the actors run."""
 
 
-def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
-    """Add the noun and its verbs."""
-    verbs = verbs_of(add_noun(nouns, "actor"))
-    actor_run.add_to(verbs)
-    actor_tell.add_to(verbs)
-    ls = add_verb(
-        verbs,
-        "ls",
-        "list the sessions of the cell with what their actors report, and which are silent",
-        run=list_actors,
-        example="enact actor ls --json",
-    )
-    add_reader(ls)
-    check = add_verb(
-        verbs,
-        "check",
-        "check all declared reads and writes of the cell's actors, without running any",
-        run=check_actors,
-        example="enact actor check --cell cell.toml\nenact actor check --graph cell.svg",
-    )
-    add_cell(check, file_only=True)
-    check.add_argument("--json", action="store_true", help="print JSON instead of lines")
-    check.add_argument(
-        "--initial",
-        action="append",
-        default=[],
-        metavar="ASPECT",
-        help="an aspect that is written from outside; may be repeated",
-    )
-    check.add_argument(
-        "--graph",
-        type=Path,
-        metavar="FILE.svg",
-        help="draw entities, aspects and actors with all declared reads and writes; of a cell that"
-        " runs, with the rate of each actor",
-    )
+def list_actors(cell: Cell, _options: argparse.Namespace) -> Output:
+    """List every session but this one; one line per reporting actor."""
+    infos = [info for info in cell.actors() if info.session != cell.session]
 
+    def details() -> None:
+        for report in (report for info in infos for report in _reports(info)):
+            if report.args:
+                print(f"{report.name}: {', '.join(report.args)}")
+            for line in _losses(report):
+                print(f"{report.name}: {line}")
 
-def list_actors(arguments: argparse.Namespace) -> int:
-    """Print every session but this one; one line per reporting actor."""
-    with open_cell(arguments) as cell:
-        infos = [info for info in cell.actors() if info.session != cell.session]
-    if arguments.json:
-        print_json(infos)
-        return DONE
-    print_table(
-        ("actor", "host", "pid", "state", "updates", "rate", "failures", "refused", "incomplete",
-         "wait p99", "last update", "lease left", "locks", "last error"),
-        [row for info in infos for row in _rows(info)],
-        empty="no actor is connected",
-    )  # fmt: skip
-    for report in (report for info in infos for report in _reports(info)):
-        if report.args:
-            print(f"{report.name}: {', '.join(report.args)}")
-        for line in _losses(report):
-            print(f"{report.name}: {line}")
-    return DONE
+    return Output(infos, details, rows=[row for info in infos for row in _rows(info)])
 
 
 def _losses(report: ActorStatistics) -> Iterator[str]:
@@ -156,23 +99,23 @@ def _state(info: ActorInfo, reported: str) -> str:
     return f"{state}, one of {len(info.namesakes) + 1}" if info.namesakes else state
 
 
-def check_actors(arguments: argparse.Namespace) -> int:
+def check_actors(options: argparse.Namespace) -> int:
     """Print what is wrong with the actors of a `cell.toml`; status 1 if there is an error."""
     from enact_dist.actor.check import check_cell
 
-    config = cell_config(arguments)
+    config = cell_config(options)
     see_modules(config.path)
-    findings = check_cell(config, initial=arguments.initial)
+    findings = check_cell(config, initial=options.initial)
     wrong = any(finding.level == "error" for finding in findings)
-    if arguments.json:
+    if options.json:
         print_json(findings)
     else:
         for finding in findings:
             print(finding)
         if all(finding.level == "advice" for finding in findings):
             print(f"ok: {len(config.actors)} actors of cell {config.name} fit together")
-    if arguments.graph is not None:
-        _draw(config, arguments.graph)
+    if options.graph is not None:
+        _draw(config, options.graph)
     return FAILED if wrong else DONE
 
 

@@ -14,25 +14,9 @@ from typing import TYPE_CHECKING
 from enact_dist.actor.running.doing import raised
 from enact_dist.actor.running.group import ANEW, DRAIN_S, ActorGroup, Life
 from enact_dist.actor.running.words import ListeningForWords
-from enact_dist.cli.verbs import (
-    DONE,
-    add_cell,
-    add_log,
-    add_timeout,
-    add_verb,
-    cell_config,
-    cell_target,
-    duration,
-    exit_status,
-    is_endpoint,
-    one_entity,
-    open_cell,
-    pair,
-    pairs,
-    seconds,
-    see_modules,
-    told,
-)
+from enact_dist.cli.arguments import pairs
+from enact_dist.cli.target import cell_config, cell_target, is_endpoint, open_cell, see_modules
+from enact_dist.cli.verbs import DONE, exit_status, told
 from enact_dist.config.table import suggestion
 from enact_dist.config.types import ActorProcess, processes_of
 from enact_dist.errors import ConfigError, EnactError, MisuseError, UnknownWorldError
@@ -47,7 +31,6 @@ if TYPE_CHECKING:
     from enact_dist.actor.actor import Actor
     from enact_dist.actor.report import ActorStatistics
     from enact_dist.actor.running.runner import ActorRun
-    from enact_dist.cli.verbs import Verb
     from enact_dist.config.types import ActorConfig, CellConfig
     from enact_dist.world.cell import Cell
 
@@ -55,63 +38,6 @@ _log = logging.getLogger("enact.actor")
 _OF_ONE = (("--name", "name"), ("--world", "world"), ("--option", "option"),
            ("--entity", "entity"), ("--every", "every"))  # fmt: skip
 """Options that say something of one actor only."""
-
-
-def add_to(verbs: argparse._SubParsersAction[Verb]) -> None:
-    """Add the verb."""
-    run = add_verb(
-        verbs,
-        "run",
-        "run one actor, or several, in this process until SIGTERM or until all are done",
-        run=run_actors,
-        example="enact actor run fusion\n"
-        "enact actor run camera-3 subtraction-3\n"
-        "enact actor run --process camera-3\n"
-        "enact actor run actors.palletizing.fusion:Fusion --world training=training"
-        " --option voxel_m=0.002",
-    )
-    run.add_argument(
-        "targets",
-        nargs="*",
-        metavar="TARGET",
-        help="MODULE:CLASS, or the name of an actor of cell.toml; several names: these share the"
-        " process, each in a thread with a session of its own",
-    )
-    run.add_argument(
-        "--process",
-        default="",
-        metavar="NAME",
-        help="run all actors that have this `process` in cell.toml",
-    )
-    add_cell(run)
-    add_timeout(run)
-    add_log(run)
-    run.add_argument("--name", default="", help="how others see it (default: class and entity)")
-    run.add_argument(
-        "--world",
-        action="append",
-        type=pair,
-        metavar="ROLE=NAME",
-        help="bind a role to a world context; without any, each role to that of its name",
-    )
-    run.add_argument(
-        "--option", action="append", type=pair, metavar="KEY=VALUE", help="argument of the class"
-    )
-    run.add_argument(
-        "--entity",
-        type=one_entity,
-        metavar="NAME",
-        help="the one entity that it works on, of those that its patterns match",
-    )
-    run.add_argument("--every", type=seconds, metavar="S", help="period of a source, seconds")
-    run.add_argument(
-        "--drain",
-        dest="drain_s",
-        type=duration,
-        metavar="S",
-        help="seconds that an update may take after SIGTERM before it is cut off (default:"
-        " `drain_s` of the actor in cell.toml, else 8)",
-    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,45 +50,45 @@ class _Made:
     drain_s: float
 
 
-def run_actors(arguments: argparse.Namespace) -> int:
+def run_actors(options: argparse.Namespace) -> int:
     """Run actors until they are done or a signal comes."""
-    process = _process(arguments)
+    process = _process(options)
     if process is not None and len(process.actors) > 1:
-        return _run_group(arguments, process)
+        return _run_group(options, process)
     manager = ServiceManager()
-    target = process.members[0] if process is not None else arguments.targets[0]
-    json_lines = JsonLines(process=f"actor {arguments.name or target}")
-    formatter = json_lines if arguments.log == "json" else TextLines()
+    target = process.members[0] if process is not None else options.targets[0]
+    json_lines = JsonLines(process=f"actor {options.name or target}")
+    formatter = json_lines if options.log == "json" else TextLines()
     _log_to_stderr(formatter)
-    made = _made(arguments, target)  # a signal ends an import at once
+    made = _made(options, target)  # a signal ends an import at once
     life = Life(made.name, made.drain_s, alive=manager.alive, ready=manager.ready)
     with StopSignals() as signals:
         for act in (lambda _: manager.stopping(), life.end):
             signals.call(act)
         signals.call_again(life.hurry)
-        return _lived(arguments, made, life, formatter)
+        return _lived(options, made, life, formatter)
 
 
-def _run_group(arguments: argparse.Namespace, process: ActorProcess) -> int:
+def _run_group(options: argparse.Namespace, process: ActorProcess) -> int:
     """Run the actors of a process, each in a thread; see `actor.running.group`."""
     manager = ServiceManager()
     json_lines = JsonLines(process=f"process {process.name}", actors=process.members)
-    formatter = json_lines if arguments.log == "json" else TextLines(process.members)
+    formatter = json_lines if options.log == "json" else TextLines(process.members)
     _begin_with(process.env)
     _log_to_stderr(formatter)
     first: dict[str, _Made | Exception] = {}
     for actor in process.actors:  # in this thread, where a signal ends an import at once
         try:
-            first[actor.name] = _made(arguments, actor.name, begun=True)
+            first[actor.name] = _made(options, actor.name, begun=True)
         except Exception as error:  # noqa: BLE001 - told where that actor begins; others run
             first[actor.name] = error
 
     def live(name: str, life: Life) -> int:
         try:
-            made = first.pop(name, None) or _made(arguments, name, begun=True)
+            made = first.pop(name, None) or _made(options, name, begun=True)
             if isinstance(made, Exception):
                 raise made
-            return _lived(arguments, made, life, formatter)
+            return _lived(options, made, life, formatter)
         except (EnactError, OSError, ImportError, MemoryError) as error:
             for line in (*getattr(error, "__notes__", ()), told(error)):
                 _log.critical("actor %s: %s", name, line)
@@ -171,7 +97,7 @@ def _run_group(arguments: argparse.Namespace, process: ActorProcess) -> int:
             _log.exception("actor %s failed", name)
             return exit_status(error)
 
-    drains_s = {one.name: _drain_s(arguments, one) for one in process.actors}
+    drains_s = {one.name: _drain_s(options, one) for one in process.actors}
     group = ActorGroup(process.name, drains_s, live, alive=manager.alive, ready=manager.ready)
     with StopSignals() as signals:
         for act in (lambda _: manager.stopping(), group.end):
@@ -181,11 +107,11 @@ def _run_group(arguments: argparse.Namespace, process: ActorProcess) -> int:
 
 
 def _lived(
-    arguments: argparse.Namespace, made: _Made, life: Life, formatter: logging.Formatter
+    options: argparse.Namespace, made: _Made, life: Life, formatter: logging.Formatter
 ) -> int:
     """Run an actor once, in a session of its own; return its exit status."""
     name = made.name
-    with open_cell(arguments, observer=False, actor=name) as cell:
+    with open_cell(options, observer=False, actor=name) as cell:
         if isinstance(formatter, JsonLines):
             formatter.cell = cell.name
             formatter.process = formatter.process if formatter.actors else f"actor {name}"
@@ -274,16 +200,16 @@ def _log_to_stderr(formatter: logging.Formatter) -> None:
 # ---------------------------------------------------------------- what the command names
 
 
-def _process(arguments: argparse.Namespace) -> ActorProcess | None:
+def _process(options: argparse.Namespace) -> ActorProcess | None:
     """Return the actors of `cell.toml` that the command names; None for one ``MODULE:CLASS``.
 
     Raises:
         ConfigError: It names none, one twice, or several with what belongs to one.
     """
-    targets: list[str] = arguments.targets
-    if arguments.process and targets:
+    targets: list[str] = options.targets
+    if options.process and targets:
         raise ConfigError("name actors, or a process with --process, not both")
-    if not targets and not arguments.process:
+    if not targets and not options.process:
         raise ConfigError("name an actor of cell.toml, MODULE:CLASS, or --process NAME")
     if len(targets) == 1 and ":" in targets[0]:
         return None
@@ -292,18 +218,18 @@ def _process(arguments: argparse.Namespace) -> ActorProcess | None:
             f"{classes[0]} runs in a process of its own; actors that share one have their tables"
             " in cell.toml, and are called by their names"
         )
-    config = cell_config(arguments)
-    if arguments.process:
-        actors = [one for one in config.actors if one.process == arguments.process]
+    config = cell_config(options)
+    if options.process:
+        actors = [one for one in config.actors if one.process == options.process]
         known = {one.process for one in config.actors if one.process}
         if not actors:
             raise ConfigError(
-                f"{config.path} has no process {arguments.process!r}"
-                f"{suggestion(arguments.process, known)} (known: {_listed(known)})"
+                f"{config.path} has no process {options.process!r}"
+                f"{suggestion(options.process, known)} (known: {_listed(known)})"
             )
     else:
         actors = [_entry(config, target) for target in targets]
-    _refuse_of_one(arguments, actors)
+    _refuse_of_one(options, actors)
     (process, *others) = processes_of(actors)
     if len(actors) > 1 and others:
         process = ActorProcess("+".join(targets), tuple(actors))
@@ -311,14 +237,14 @@ def _process(arguments: argparse.Namespace) -> ActorProcess | None:
     return process
 
 
-def _refuse_of_one(arguments: argparse.Namespace, actors: list[ActorConfig]) -> None:
+def _refuse_of_one(options: argparse.Namespace, actors: list[ActorConfig]) -> None:
     """Raise `ConfigError` where several actors are given what belongs to one, or one twice."""
     names = [one.name for one in actors]
     twice = next((name for name in names if names.count(name) > 1), "")
     if twice:
         raise ConfigError(f"actor {twice} is named twice")
     for option, key in _OF_ONE if len(actors) > 1 else ():
-        if getattr(arguments, key) not in (None, "", []):
+        if getattr(options, key) not in (None, "", []):
             raise ConfigError(
                 f"{option} belongs to one actor, but the command runs {', '.join(names)}; write it"
                 " into their tables of cell.toml"
@@ -346,11 +272,11 @@ def _entry(config: CellConfig, name: str) -> ActorConfig:
     )
 
 
-def _made(arguments: argparse.Namespace, target: str, *, begun: bool = False) -> _Made:
+def _made(options: argparse.Namespace, target: str, *, begun: bool = False) -> _Made:
     """Make an actor that the command names.
 
     Args:
-        arguments: Those of the command.
+        options: Those of the command.
         target: The actor.
         begun: Whether the process has begun with all variables already; what an actor's module
             makes of one when it is loaded is its own business.
@@ -361,39 +287,39 @@ def _made(arguments: argparse.Namespace, target: str, *, begun: bool = False) ->
     from enact_dist.actor.actor import name_of
     from enact_dist.actor.running.load import check_every_s, configured_actor, load_actor
 
-    worlds = pairs(arguments.world, "--world") or None
-    options = pairs(arguments.option, "--option")
-    drain_s = DRAIN_S if arguments.drain_s is None else arguments.drain_s
+    worlds = pairs(options.world, "--world") or None
+    given = pairs(options.option, "--option")
+    drain_s = DRAIN_S if options.drain_s is None else options.drain_s
     if ":" in target:
-        see_modules(_cell_file(arguments))
-        actor = load_actor(target, options)
+        see_modules(_cell_file(options))
+        actor = load_actor(target, given)
         name = ""
     else:
-        config = cell_config(arguments)
+        config = cell_config(options)
         see_modules(config.path)
         entry = _entry(config, target)
-        if options:
+        if given:
             raise ConfigError(f"the options of {entry.name} stand in {config.path}; leave --option")
         if not begun:
             _begin_with(entry.env)
         actor = configured_actor(entry)
         name = entry.name
-        drain_s = _drain_s(arguments, entry)
+        drain_s = _drain_s(options, entry)
         worlds = worlds or dict(entry.worlds) or None
-    if arguments.every is not None:
-        check_every_s(type(actor), arguments.every)
-        actor.every_s = arguments.every
-    if arguments.entity is not None:
-        actor.only_entity = arguments.entity
+    if options.every is not None:
+        check_every_s(type(actor), options.every)
+        actor.every_s = options.every
+    if options.entity is not None:
+        actor.only_entity = options.entity
     try:
         actor.declaration.check_entity(actor.only_entity)
     except MisuseError as error:
         raise ConfigError(str(error)) from None
-    return _Made(actor, arguments.name or name or name_of(actor), worlds, drain_s)
+    return _Made(actor, options.name or name or name_of(actor), worlds, drain_s)
 
 
-def _drain_s(arguments: argparse.Namespace, entry: ActorConfig) -> float:
-    for drain_s in (arguments.drain_s, entry.drain_s):
+def _drain_s(options: argparse.Namespace, entry: ActorConfig) -> float:
+    for drain_s in (options.drain_s, entry.drain_s):
         if drain_s is not None:
             return float(drain_s)
     return DRAIN_S
@@ -409,10 +335,10 @@ def _begin_with(env: Mapping[str, str]) -> None:
         os.execve(command[0], command, {**os.environ, **env})  # noqa: S606 - itself
 
 
-def _cell_file(arguments: argparse.Namespace) -> Path | None:
+def _cell_file(options: argparse.Namespace) -> Path | None:
     """Return the cell.toml that the command names; None where it names an endpoint, or nothing."""
     try:
-        target = cell_target(arguments)
+        target = cell_target(options)
     except ConfigError:
         return None  # reported when the cell is opened
     return None if is_endpoint(target) else Path(target).expanduser()

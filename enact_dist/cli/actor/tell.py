@@ -7,22 +7,14 @@ import time
 from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.actor.running.words import reports_of, tell_reported
-from enact_dist.cli.verbs import (
-    DONE,
-    FAILED,
-    add_cell,
-    add_timeout,
-    add_verb,
-    open_cell,
-    pair,
-    pairs,
-)
+from enact_dist.cli.arguments import pairs
+from enact_dist.cli.target import open_cell
+from enact_dist.cli.verbs import DONE, FAILED
 from enact_dist.errors import MisuseError
 
 if TYPE_CHECKING:
     import argparse
 
-    from enact_dist.cli.verbs import Verb
     from enact_dist.world.cell import Cell
     from enact_dist.world.listings import ActorInfo
 
@@ -35,71 +27,42 @@ RETURN_S: Final = 60.0
 """How long an actor may take to end and to run again."""
 
 
-def add_to(verbs: argparse._SubParsersAction[Verb]) -> None:
-    """Add both verbs."""
-    change = add_verb(
-        verbs,
-        "set",
-        "change attributes of a running actor until it ends; cell.toml has the values that it"
-        " starts with",
-        run=set_values,
-        example="enact actor set camera gain=0.7 label=front",
-    )
-    restart = add_verb(
-        verbs,
-        "restart",
-        "restart an actor after its current update; its supervisor (enact up, systemd, docker)"
-        " starts it again",
-        run=restart_actor,
-        example="enact actor restart camera",
-    )
-    for verb in (change, restart):
-        verb.add_argument(
-            "name", metavar="NAME", help="name of the actor, as enact actor ls shows it"
-        )
-        add_cell(verb)
-        add_timeout(verb)
-    change.add_argument(
-        "values", nargs="+", type=pair, metavar="KEY=VALUE", help="attribute and its new value"
-    )
-
-
-def set_values(arguments: argparse.Namespace) -> int:
+def set_values(options: argparse.Namespace) -> int:
     """Change every actor of the name; fail if one refuses."""
-    values = pairs(arguments.values, "set")
-    with open_cell(arguments, observer=False, actor="enact actor set") as cell:
+    values = pairs(options.values, "set")
+    with open_cell(options, observer=False, actor="enact actor set") as cell:
         status = DONE
-        for info, row in _found(cell, arguments.name):
+        for info, row in _found(cell, options.name):
             token = tell_reported(cell, info, row, {"set": values})
-            answer = _answer(cell, info.session, arguments.name, token)
+            answer = _answer(cell, info.session, options.name, token)
             if answer != "done":
                 where = f"{info.host} pid {info.pid}"
-                print(f"enact: actor {arguments.name} at {where}: {answer}", file=sys.stderr)
+                print(f"enact: actor {options.name} at {where}: {answer}", file=sys.stderr)
                 status = FAILED
                 continue
             told = ", ".join(f"{key} = {value}" for key, value in values.items())
-            print(f"actor {arguments.name} at {info.host} pid {info.pid}: {told}")
+            print(f"actor {options.name} at {info.host} pid {info.pid}: {told}")
     return status
 
 
-def restart_actor(arguments: argparse.Namespace) -> int:
+def restart_actor(options: argparse.Namespace) -> int:
     """Ask every actor of the name to restart, and wait until as many new ones run."""
-    with open_cell(arguments, observer=False, actor="enact actor restart") as cell:
-        before = _found(cell, arguments.name)
+    with open_cell(options, observer=False, actor="enact actor restart") as cell:
+        before = _found(cell, options.name)
         for info, row in before:
             tell_reported(cell, info, row, {"restart": True})
         old = {info.session for info, _ in before}
         end_s = time.monotonic() + RETURN_S
         while time.monotonic() < end_s:
-            rows = reports_of(cell, arguments.name)
+            rows = reports_of(cell, options.name)
             back = [info for info, row in rows if info.session not in old and _runs(row)]
             if len(back) >= len(before) and not old & {info.session for info, _ in rows}:
                 for info in back:
-                    print(f"actor {arguments.name} restarted at {info.host} pid {info.pid}")
+                    print(f"actor {options.name} restarted at {info.host} pid {info.pid}")
                 return DONE
             time.sleep(LOOK_S)
     print(
-        f"enact: actor {arguments.name} did not restart within {RETURN_S:g} s; check that its"
+        f"enact: actor {options.name} did not restart within {RETURN_S:g} s; check that its"
         " update ends, and that enact up, systemd or docker runs it and so starts it again",
         file=sys.stderr,
     )

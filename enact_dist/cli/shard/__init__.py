@@ -1,1 +1,141 @@
-"""`enact shard`: list, run, back up and rebalance shards."""
+"""`enact shard`: the table of its verbs; the modules beside carry them out."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from enact_dist.cli.arguments import (
+    CELL_FILE,
+    JSON,
+    LOG,
+    READER,
+    address,
+    duration,
+    endpoints,
+    file_of,
+    pair,
+)
+from enact_dist.cli.verbs import OneOf, Option, Verb, flag, many, option
+from enact_dist.link.daemon.counters import BODIES
+
+CHECK_S: Final = 2.0
+"""How long a health check waits: it is called every few seconds, and a local answer takes 1 ms."""
+
+_NAME: Final = option("name", "NAME", "name of the shard in cell.toml")
+_FOLDER: Final = file_of("--folder", "DIR", "folder of the shard, unless it is that of cell.toml")
+
+
+def _path(name: str, text: str) -> Option:
+    return file_of(name, "DIR", text, dest="path", required=True)
+
+
+def _store(text: str) -> Option:
+    return many("--store", "NAME=PATH", text, type=pair)
+
+
+VERBS: Final = (
+    Verb(
+        "run", "run one shard daemon of the cell until SIGTERM", "shard:run_shard",
+        "enact shard run left --cell cell.toml",
+        (
+            _NAME,
+            CELL_FILE,
+            many("--listen", "ENDPOINT", "replaces `listen` of cell.toml", type=endpoints),
+            many("--advertise", "ENDPOINT", "replaces `advertise`", type=endpoints),
+            option("--folder", "DIR", "replaces `folder` of cell.toml"),
+            option("--metrics", "HOST:PORT",
+                   "serve /metrics for Prometheus there; a port alone is one of the loopback",
+                   type=address),
+            LOG,
+            option("--drain", "S",
+                   "seconds that holders of locks may still finish after SIGTERM (default:"
+                   " `drain_s` of cell.toml, or 0.8)", dest="drain_s", type=duration),
+        ),
+    ),
+    Verb(
+        "ls",
+        f"list the shards of the cell and their states; data: bytes of {BODIES}",
+        "shard:list_shards",
+        "enact shard ls --cell tcp/127.0.0.1:7447",
+        (flag("--counters", "list the counters of each shard, and what they mean"), *READER),
+        columns=("shard", "endpoint", "state", "epoch", "up", "slots", "data", "shared", "sessions",
+                 "locks", "rtt"),
+        empty="no shards",
+    ),
+    Verb(
+        "check", "ask shards whether they are ready, or alive; made to be called every few seconds",
+        "shard:check_shards",
+        "enact shard check left --cell cell.toml --alive\n"
+        "enact shard check --cell tcp/127.0.0.1:7447 --json",
+        (
+            option("name", "NAME", "name of the shard (default: each one of the cell)", nargs="?"),
+            OneOf((
+                flag("--ready", "check that it answers and grants locks (the default)"),
+                flag("--alive", "check that it answers"),
+            )),
+            *READER,
+        ),
+        defaults={"timeout_s": CHECK_S},
+    ),
+    Verb(
+        "rebalance", "move entities to where cell.toml places them, while the cell is stopped",
+        "rebalance:run_rebalance",
+        "enact shard rebalance --cell cell.toml --new third --dry-run\n"
+        "enact shard rebalance --cell cell.toml --store right=/mnt/copy/right\n"
+        "enact shard rebalance --cell cell.toml --store gone=data/gone",
+        (
+            CELL_FILE,
+            _store("folder of a shard: a copy of one on another host, or of one that leaves the"
+                   " cell"),
+            many("--new", "NAME", "this shard is new: it is no mistake that it has no data yet",
+                 default=[]),
+            flag("--dry-run", "list what would move, change nothing"),
+            JSON,
+        ),
+    ),
+    Verb(
+        "forget",
+        "delete aspects with their types and all their data, while the cell is stopped; then they"
+        " may be registered with other types",
+        "forget:run_forget",
+        "enact shard forget surface --cell cell.toml\n"
+        "enact shard forget surface contact_count --cell cell.toml --yes\n"
+        "enact shard forget --unused --cell cell.toml --dry-run",
+        (
+            option("aspects", "ASPECT", "name of an aspect", nargs="*"),
+            flag("--unused",
+                 "delete all aspects and world contexts without data, except forks and those that"
+                 " cell.toml names"),
+            CELL_FILE,
+            _store("folder of a shard that is not where the cell.toml says"),
+            many("--shard", "NAME",
+                 "only this one: it was restored from a backup that has the aspect as it was",
+                 default=[]),
+            OneOf((
+                flag("--dry-run", "list what would be deleted, change nothing (status 0)"),
+                flag("--yes",
+                     "delete it; without this option the command only lists it, with status 1 where"
+                     " there is anything"),
+            )),
+            JSON,
+        ),
+    ),
+    Verb(
+        "backup", "copy the data of a shard on this host to a new folder, whether it runs or not",
+        "backup:run_backup",
+        "enact shard backup left --to backups/left-1 --cell cell.toml",
+        (_NAME, _path("--to", "a folder that does not exist yet"), _FOLDER, CELL_FILE, JSON),
+    ),
+    Verb(
+        "restore", "let a stopped shard start again with what a backup holds", "backup:run_restore",
+        "enact shard restore left --from backups/left-1 --replace --cell cell.toml",
+        (
+            _NAME,
+            _path("--from", "the folder of the backup"),
+            _FOLDER,
+            CELL_FILE,
+            JSON,
+            flag("--replace", "move the present folder aside, beside it"),
+        ),
+    ),
+)  # fmt: skip

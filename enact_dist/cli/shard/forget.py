@@ -13,105 +13,60 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from enact_dist.cli.arguments import pairs
+from enact_dist.cli.target import cell_config
 from enact_dist.cli.text.output import ProgressLine, print_json, print_table, shown_bytes
-from enact_dist.cli.verbs import DONE, FAILED, add_cell, add_verb, cell_config, pair, pairs
+from enact_dist.cli.verbs import DONE, FAILED
 from enact_dist.errors import ConfigError
 
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Iterable
 
-    from enact_dist.cli.verbs import Verb
     from enact_dist.config.types import CellConfig
     from enact_dist.link.offline.forgetting import Forgotten
 
 
-def add_to(verbs: argparse._SubParsersAction[Verb]) -> None:
-    """Add the verb."""
-    verb = add_verb(
-        verbs,
-        "forget",
-        "forget aspects with their types and all their data, while the cell is stopped; then they"
-        " may be registered with other types",
-        run=run_forget,
-        example="enact shard forget surface --cell cell.toml\n"
-        "enact shard forget surface contact_count --cell cell.toml --yes\n"
-        "enact shard forget --unused --cell cell.toml --dry-run",
-    )
-    verb.add_argument("aspects", metavar="ASPECT", nargs="*", help="name of an aspect")
-    verb.add_argument(
-        "--unused",
-        action="store_true",
-        help="forget all aspects and world contexts without data, except forks and those that"
-        " cell.toml names",
-    )
-    add_cell(verb, file_only=True)
-    verb.add_argument(
-        "--store",
-        action="append",
-        type=pair,
-        metavar="NAME=PATH",
-        help="folder of a shard that is not where the cell.toml says",
-    )
-    verb.add_argument(
-        "--shard",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="only this one: it was restored from a backup that has the aspect as it was",
-    )
-    what = verb.add_mutually_exclusive_group()
-    what.add_argument(
-        "--dry-run", action="store_true", help="say what would go, change nothing (status 0)"
-    )
-    what.add_argument(
-        "--yes",
-        action="store_true",
-        help="let it go; without it that is only said, with status 1 where there is anything",
-    )
-    verb.add_argument("--json", action="store_true", help="print JSON instead of a table")
-
-
-def run_forget(arguments: argparse.Namespace) -> int:
+def run_forget(options: argparse.Namespace) -> int:
     """Say what goes and let it go; it may be killed at any time and called again."""
     from enact_dist.link.offline.forgetting import forget, look
 
-    config = cell_config(arguments)
-    folders, elsewhere = _folders(config, pairs(arguments.store, "--store"), arguments)
-    if not arguments.aspects and not arguments.unused:
+    config = cell_config(options)
+    folders, elsewhere = _folders(config, pairs(options.store, "--store"), options)
+    if not options.aspects and not options.unused:
         raise ConfigError("name the aspects to forget, or --unused for all without data")
-    if arguments.unused and len(folders) < sum(s.folder is not None for s in config.shards):
+    if options.unused and len(folders) < sum(s.folder is not None for s in config.shards):
         raise ConfigError(
             f"--unused needs the data of all shards, but {'; '.join(elsewhere) or 'not all'}:"
             " name the folders of the others with --store"
         )
-    unused = config.worlds if arguments.unused else None
-    told = _Told(as_json=arguments.json, goes="goes" if arguments.yes else "would go")
+    unused = config.worlds if options.unused else None
+    told = _Told(as_json=options.json, goes="goes" if options.yes else "would go")
     if not folders:
         raise ConfigError(f"no shard of {config.path} has its data here: {'; '.join(elsewhere)}")
     try:
-        if arguments.yes:
+        if options.yes:
             found = forget(
                 folders,
-                arguments.aspects,
+                options.aspects,
                 now_ns=time.time_ns(),
                 unused=unused,
                 progress=told,
             )
         else:
-            found = look(folders, arguments.aspects, unused=unused, progress=told)
+            found = look(folders, options.aspects, unused=unused, progress=told)
     finally:
         told.line.end()
-    if arguments.json:
-        print_json(_facts(found, elsewhere, done=arguments.yes))
-    elif arguments.yes and (found.going or found.resumed or found.worlds):
+    if options.json:
+        print_json(_facts(found, elsewhere, done=options.yes))
+    elif options.yes and (found.going or found.resumed or found.worlds):
         print(_end(found))
     for line in elsewhere:
         print(f"enact: {line}", file=sys.stderr)
-    if arguments.yes or arguments.dry_run or not (found.going or found.resumed or found.worlds):
+    if options.yes or options.dry_run or not (found.going or found.resumed or found.worlds):
         return DONE
-    named = ["--unused"] if arguments.unused else found.aspects or found.done
-    words = _command(named, arguments.shard)
+    named = ["--unused"] if options.unused else found.aspects or found.done
+    words = _command(named, options.shard)
     print(f"enact: nothing was changed; to let it go: {words}", file=sys.stderr)
     return FAILED
 
@@ -122,18 +77,18 @@ def _command(aspects: Iterable[str], shards: Iterable[str] = ()) -> str:
 
 
 def _folders(
-    config: CellConfig, stores: dict[str, str], arguments: argparse.Namespace
+    config: CellConfig, stores: dict[str, str], options: argparse.Namespace
 ) -> tuple[dict[str, Path], list[str]]:
     """Return the folders of the shards that have data here, and remarks about the others."""
     from enact_dist.link.folder.folder import holds_store
 
-    for name in (*stores, *arguments.shard):
+    for name in (*stores, *options.shard):
         config.shard(name)
     folders: dict[str, Path] = {}
     elsewhere: list[str] = []
-    command = f"`{_command(arguments.aspects)}`"
+    command = f"`{_command(options.aspects)}`"
     for shard in config.shards:
-        if arguments.shard and shard.name not in arguments.shard:
+        if options.shard and shard.name not in options.shard:
             continue
         folder = Path(stores[shard.name]) if shard.name in stores else shard.folder
         if folder is None:

@@ -10,14 +10,15 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.cli.arguments import pairs
+from enact_dist.cli.target import cell_config
 from enact_dist.cli.text.output import ProgressLine, print_json, print_table, shown_bytes, shown_s
-from enact_dist.cli.verbs import DONE, add_cell, add_verb, cell_config, pair, pairs
+from enact_dist.cli.verbs import DONE
 from enact_dist.errors import ConfigError, StoreError
 
 if TYPE_CHECKING:
     import argparse
 
-    from enact_dist.cli.verbs import Verb
     from enact_dist.config.types import CellConfig, ShardConfig
     from enact_dist.link.offline.rebalance import Rebalance
 
@@ -25,45 +26,15 @@ LISTED_MAX: Final = 20
 """So many moves are listed one by one for people; `--json` lists all."""
 
 
-def add_to(verbs: argparse._SubParsersAction[Verb]) -> None:
-    """Add the verb."""
-    verb = add_verb(
-        verbs,
-        "rebalance",
-        "move entities to where cell.toml places them, while the cell is stopped",
-        run=run_rebalance,
-        example="enact shard rebalance --cell cell.toml --new third --dry-run\n"
-        "enact shard rebalance --cell cell.toml --store right=/mnt/copy/right\n"
-        "enact shard rebalance --cell cell.toml --store gone=data/gone",
-    )
-    add_cell(verb, file_only=True)
-    verb.add_argument(
-        "--store",
-        action="append",
-        type=pair,
-        metavar="NAME=PATH",
-        help="folder of a shard: a copy of one on another host, or of one that leaves the cell",
-    )
-    verb.add_argument(
-        "--new",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="this shard is new: that it has no data yet is no mistake",
-    )
-    verb.add_argument("--dry-run", action="store_true", help="say what would move, change nothing")
-    verb.add_argument("--json", action="store_true", help="print JSON instead of a table")
-
-
-def run_rebalance(arguments: argparse.Namespace) -> int:
+def run_rebalance(options: argparse.Namespace) -> int:
     """Move what has to be moved; it may be killed at any time and called again."""
     from enact_dist.link.offline.rebalance import look, rebalance
 
-    config = cell_config(arguments)
-    stores = pairs(arguments.store, "--store")
-    folders = _folders(config, stores, arguments.new)
+    config = cell_config(options)
+    stores = pairs(options.store, "--store")
+    folders = _folders(config, stores, options.new)
     placement = config.placement_map()
-    if arguments.dry_run:
+    if options.dry_run:
         found = look(folders, placement)
     else:
         progress = _Shown()
@@ -71,11 +42,11 @@ def run_rebalance(arguments: argparse.Namespace) -> int:
             found = rebalance(folders, placement, unix_s=int(time.time()), progress=progress)
         finally:
             progress.line.end()
-    if arguments.json:
+    if options.json:
         moves = [move._asdict() for move in found.moves]
-        print_json({"done": not arguments.dry_run, "resumed": found.resumed, "moves": moves})
+        print_json({"done": not options.dry_run, "resumed": found.resumed, "moves": moves})
     else:
-        _print(found, dry_run=arguments.dry_run)
+        _print(found, dry_run=options.dry_run)
     _name_others(config, folders)
     return DONE
 
@@ -137,7 +108,8 @@ def _folder(shard: ShardConfig, stores: dict[str, str], new: list[str], config: 
         where = f"is on host {shard.host}" if elsewhere else f"has no data in {folder}"
         raise ConfigError(
             f"shard {name} {where}: copy its folder here and name it with --store {name}=PATH;"
-            f" if the shard is new, say --new {name}" + (" as well" if elsewhere else "")
+            f" if the shard is new, say --new {name}{' as well' if elsewhere else ''}"
+            " (see docs/operations.md)"
         )
     return folder
 

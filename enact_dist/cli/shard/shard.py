@@ -1,158 +1,56 @@
-"""`enact shard run|ls|check`; operations on shards' folders have their own modules."""
+"""`enact shard run|ls|check`."""
 
 from __future__ import annotations
 
 import os
 import sys
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
-from enact_dist.cli.shard import backup as shard_backup
-from enact_dist.cli.shard import forget as shard_forget
-from enact_dist.cli.shard import rebalance as shard_rebalance
-from enact_dist.cli.text.output import print_json, print_table, shown_bytes, shown_s
-from enact_dist.cli.verbs import (
-    DONE,
-    FAILED,
-    UNREACHABLE,
-    add_cell,
-    add_log,
-    add_noun,
-    add_reader,
-    add_verb,
-    address,
-    cell_target,
-    duration,
-    endpoints,
-    is_endpoint,
-    open_cell,
-    verbs_of,
-)
+from enact_dist.cli.target import cell_target, is_endpoint, open_cell
+from enact_dist.cli.text.output import print_table, shown_bytes, shown_s
+from enact_dist.cli.verbs import DONE, FAILED, UNREACHABLE, Output
 from enact_dist.core.state.clock import state_of
 from enact_dist.errors import ConfigError
-from enact_dist.link.daemon.counters import BODIES, told
+from enact_dist.link.daemon.counters import told
 
 if TYPE_CHECKING:
     import argparse
+    from collections.abc import Sequence
 
-    from enact_dist.cli.verbs import Verb
     from enact_dist.link.daemon.health import ShardHealth
     from enact_dist.world.listings import ShardInfo
 
-CHECK_S: Final = 2.0
-"""How long a health check waits: it is called every few seconds, and a local answer takes 1 ms."""
 
-
-def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
-    """Add the noun and its verbs."""
-    verbs = verbs_of(add_noun(nouns, "shard"))
-    _add_run(verbs)
-    ls = add_verb(
-        verbs,
-        "ls",
-        f"list the shards of the cell and how they are; data: bytes of {BODIES}",
-        run=list_shards,
-        example="enact shard ls --cell tcp/127.0.0.1:7447",
-    )
-    ls.add_argument(
-        "--counters", action="store_true", help="list what each has counted, and what that means"
-    )
-    add_reader(ls)
-    check = add_verb(
-        verbs,
-        "check",
-        "ask shards whether they are ready, or alive; made to be called every few seconds",
-        run=check_shards,
-        example="enact shard check left --cell cell.toml --alive\n"
-        "enact shard check --cell tcp/127.0.0.1:7447 --json",
-    )
-    check.add_argument(
-        "name", metavar="NAME", nargs="?", help="name of the shard (default: each one of the cell)"
-    )
-    asks = check.add_mutually_exclusive_group()
-    asks.add_argument(
-        "--ready", action="store_true", help="it answers and grants locks (the default)"
-    )
-    asks.add_argument("--alive", action="store_true", help="it answers")
-    add_reader(check)
-    check.set_defaults(timeout_s=CHECK_S)
-    shard_rebalance.add_to(verbs)
-    shard_forget.add_to(verbs)
-    shard_backup.add_to(verbs)
-
-
-def _add_run(verbs: argparse._SubParsersAction[Verb]) -> None:
-    run = add_verb(
-        verbs,
-        "run",
-        "run one shard daemon of the cell until SIGTERM",
-        run=run_shard,
-        example="enact shard run left --cell cell.toml",
-    )
-    run.add_argument("name", metavar="NAME", help="name of the shard in cell.toml")
-    add_cell(run, file_only=True)
-    run.add_argument(
-        "--listen",
-        action="append",
-        type=endpoints,
-        metavar="ENDPOINT",
-        help="replaces `listen` of cell.toml",
-    )
-    run.add_argument(
-        "--advertise",
-        action="append",
-        type=endpoints,
-        metavar="ENDPOINT",
-        help="replaces `advertise`",
-    )
-    run.add_argument("--folder", metavar="DIR", help="replaces `folder` of cell.toml")
-    run.add_argument(
-        "--metrics",
-        type=address,
-        metavar="HOST:PORT",
-        help="serve /metrics for Prometheus there; a port alone is one of the loopback",
-    )
-    add_log(run)
-    run.add_argument(
-        "--drain",
-        dest="drain_s",
-        type=duration,
-        default=None,
-        metavar="S",
-        help="seconds that holders of locks may still finish after SIGTERM (default: `drain_s` of"
-        " cell.toml, or 0.8)",
-    )
-
-
-def run_shard(arguments: argparse.Namespace) -> int:
+def run_shard(options: argparse.Namespace) -> int:
     """Run one shard daemon in this process."""
     from enact_dist.config.environment import variable_of
     from enact_dist.config.read import load_config
     from enact_dist.link.daemon import daemon as shard_daemon
 
-    target = cell_target(arguments)
+    target = cell_target(options)
     if is_endpoint(target):
         raise ConfigError(f"{target} is an endpoint; a shard needs the cell.toml: --cell FILE")
     environment = dict(os.environ)
     for key, found in (
-        ("LISTEN", ",".join(arguments.listen or ())),
-        ("ADVERTISE", ",".join(arguments.advertise or ())),
-        ("FOLDER", arguments.folder),
-        ("METRICS", arguments.metrics),
+        ("LISTEN", ",".join(options.listen or ())),
+        ("ADVERTISE", ",".join(options.advertise or ())),
+        ("FOLDER", options.folder),
+        ("METRICS", options.metrics),
     ):
         if found:
-            environment[variable_of(arguments.name, key)] = found
+            environment[variable_of(options.name, key)] = found
     # The name comes first: an override for a shard that is not there would blame the override.
-    written = load_config(target).shard(arguments.name)
+    written = load_config(target).shard(options.name)
     config = load_config(target, environment=environment)
-    shard = config.shard(arguments.name)
-    drain_s = shard.drain_s if arguments.drain_s is None else arguments.drain_s
+    shard = config.shard(options.name)
+    drain_s = shard.drain_s if options.drain_s is None else options.drain_s
     return shard_daemon.run_shard(
         shard_daemon.DaemonSettings(
             cell=config.name,
             shard=config.shard_settings(shard.name),
             listen=shard.listen,
             folder=shard.folder,
-            log=arguments.log,
+            log=options.log,
             link_lease_s=config.ttl_s / 2,
             carrier=config.carrier,
             shared_bytes_max=config.shared_bytes_max,
@@ -163,64 +61,62 @@ def run_shard(arguments: argparse.Namespace) -> int:
     )
 
 
-def list_shards(arguments: argparse.Namespace) -> int:
-    """Print all shards, also those that cannot be reached; why, if it is known, on a line each."""
-    with open_cell(arguments) as cell:
+def list_shards(options: argparse.Namespace) -> Output:
+    """List all shards, also those that cannot be reached; why, if it is known, on a line each."""
+    with open_cell(options) as cell:
         shards = cell.shards()
-    if arguments.json:
-        print_json(shards)
-    elif arguments.counters:
-        print_table(
-            ("shard", "counter", "value", "meaning", "what to do"),
-            [(shard.name, *row) for shard in shards for row in told(shard.counters)],
-            empty="no counters",
-        )
-    else:
-        print_table(
-            ("shard", "endpoint", "state", "epoch", "up", "slots", "data", "shared", "sessions",
-             "locks", "rtt"),
-            [_row(shard) for shard in shards],
-            empty="no shards",
-        )  # fmt: skip
-    if not arguments.json:
+    status = DONE if all(shard.reachable for shard in shards) else UNREACHABLE
+
+    def problems() -> None:
         for shard in shards:
             if shard.problem:
                 print(f"enact: shard {shard.name}: {shard.problem}", file=sys.stderr)
-    return DONE if all(shard.reachable for shard in shards) else UNREACHABLE
+
+    def counters() -> None:
+        _print_counters(shards)
+        problems()
+
+    if options.counters:
+        return Output(shards, counters, status=status)
+    return Output(shards, problems, rows=[*map(_row, shards)], status=status)
 
 
-def check_shards(arguments: argparse.Namespace) -> int:
+def _print_counters(shards: Sequence[ShardInfo]) -> None:
+    print_table(
+        ("shard", "counter", "value", "meaning", "what to do"),
+        [(shard.name, *row) for shard in shards for row in told(shard.counters)],
+        empty="no counters",
+    )
+
+
+def check_shards(options: argparse.Namespace) -> Output:
     """Ask shards how they are; status 3 if one does not answer, 1 if one grants no locks.
 
     *Alive*: the shard's dispatcher answers a request that came over its endpoint; a supervisor
     should restart one that is not alive.  *Ready*: it grants locks as well, so it neither waits
     for leases of before its start to end nor drains before its end; both pass by themselves.
     """
-    found = _health(arguments)
-    if arguments.json:
-        print_json(found)
-    else:
-        for shard in found:
-            print(shard)
+    found = _health(options)
+    status = DONE if options.alive or all(shard.ready for shard in found) else FAILED
     if not all(shard.alive for shard in found):
-        return UNREACHABLE
-    return DONE if arguments.alive or all(shard.ready for shard in found) else FAILED
+        status = UNREACHABLE
+    return Output(found, "\n".join(map(str, found)), status=status)
 
 
-def _health(arguments: argparse.Namespace) -> list[ShardHealth]:
+def _health(options: argparse.Namespace) -> list[ShardHealth]:
     from enact_dist.link.daemon import health as shard_health
 
-    target = cell_target(arguments)
+    target = cell_target(options)
     if is_endpoint(target):
-        return shard_health.of_endpoint(target, arguments.name, timeout_s=arguments.timeout_s)
+        return shard_health.of_endpoint(target, options.name, timeout_s=options.timeout_s)
     from enact_dist.config.read import load_config
 
     config = load_config(target)
-    names = [arguments.name] if arguments.name else [shard.name for shard in config.shards]
+    names = [options.name] if options.name else [shard.name for shard in config.shards]
     endpoints = {
         name: (*config.shard(name).advertise, *config.shard(name).listen) for name in names
     }
-    return shard_health.of_shards(config.name, endpoints, timeout_s=arguments.timeout_s)
+    return shard_health.of_shards(config.name, endpoints, timeout_s=options.timeout_s)
 
 
 def _row(shard: ShardInfo) -> tuple[object, ...]:

@@ -70,7 +70,7 @@ def type_of(aspect: str, fingerprint: str) -> Any:
     if "{" in fingerprint or "<" in fingerprint:
         raise MisuseError(
             f"the aspect {aspect!r} holds {fingerprint}, whose Python type is not known here;"
-            " write it from Python: lock[Write(world, entity, aspect)] = …"
+            " write it from Python: lock[Write(world, entity, aspect)] = … (see docs/data.md)"
         )
     return _parsed(fingerprint)
 

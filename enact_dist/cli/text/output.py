@@ -7,12 +7,13 @@ import json
 import os
 import sys
 import time
-from typing import TYPE_CHECKING, Final, Protocol
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
 
 from enact_dist.wire.texts import shown, shown_json
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Sequence
     from typing import IO
 
 COLOURS = ("36", "33", "35", "32", "34", "31", "96", "93", "95", "92")
@@ -91,16 +92,23 @@ def _plain_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         print("  ".join(padded).rstrip())
 
 
-class Branch(Protocol):
-    """A part of a tree: its own line and the parts below it, by name."""
+@dataclass(slots=True)
+class Branch:
+    """A part of a tree: its own line, and the parts below it by name."""
 
-    @property
-    def label(self) -> str:
-        """The line of this part."""
+    label: str
+    children: dict[str, Branch] = field(default_factory=dict)
 
-    @property
-    def children(self) -> Mapping[str, Branch]:
-        """The parts below."""
+    def at(self, segments: list[str]) -> Branch:
+        """Return the branch at a path below this one, growing it where needed."""
+        branch = self
+        for segment in segments:
+            branch = branch.children.setdefault(segment, Branch(f"{segment}/"))
+        return branch
+
+    def add(self, branch: Branch) -> None:
+        """Put a branch below this one, after the others."""
+        self.children[str(len(self.children))] = branch
 
 
 def print_tree(root: Branch, out: IO[str] | None = None) -> None:

@@ -1,54 +1,43 @@
-"""Slots and data of a world context as a command line shows them, of the present or the past."""
+"""Slots and data of a world context as a command line shows them, and why one is missing."""
 
 from __future__ import annotations
 
+import itertools
 import time
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Final
 
-from enact_dist.cli.text.output import print_json, print_tree, shown_bytes, shown_s
+from enact_dist.cli.text.output import Branch, print_tree, shown_bytes, shown_s
+from enact_dist.cli.verbs import Output
+from enact_dist.config.table import suggestion
+from enact_dist.errors import EnactError, NullDatumError
+from enact_dist.terms import NullReason
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from enact_dist.access.snapshot import SlotInfo
+    from enact_dist.world.context import WorldContext
+    from enact_dist.world.past import PastContext
+
+COMPARED_MAX: Final = 1000
+"""Names examined for a similar one: takes a few hundredths of a second."""
 
 
-@dataclass(slots=True)
-class Branch:
-    """One segment of an entity's path: its line, and what lies below."""
-
-    label: str
-    children: dict[str, Branch] = field(default_factory=dict)
-
-    def at(self, segments: list[str]) -> Branch:
-        """Return the branch at a path below this one, growing it where needed."""
-        branch = self
-        for segment in segments:
-            branch = branch.children.setdefault(segment, Branch(f"{segment}/"))
-        return branch
-
-
-def print_slots(
-    title: str, infos: Sequence[SlotInfo], *, as_json: bool, at_ns: int | None = None
-) -> None:
-    """Print slots as a tree of their entities, aspects as its leaves.
+def slots_output(title: str, infos: Sequence[SlotInfo], *, at_ns: int | None = None) -> Output:
+    """Return slots as a tree of their entities, aspects as its leaves; for programs, as a list.
 
     Args:
         title: Name of the world context.
         infos: The slots.
-        as_json: Whether to print a list for programs instead.
         at_ns: The moment that their ages count to; None: now.
     """
-    if as_json:
-        print_json([_slot_facts(info) for info in infos])
-        return
     root = Branch(f"{title} ({len(infos)} data)")
     for info in infos:
         # A segment cannot contain a space, so an aspect never hides an entity of its name.
         leaf = f"{info.aspect}  {_slot_line(info, at_ns)}"
         root.at(info.entity.name.split("/")).children[f" {info.aspect}"] = Branch(leaf)
-    print_tree(root)
+    return Output([_slot_facts(info) for info in infos], lambda: print_tree(root))
 
 
 def _slot_facts(info: SlotInfo) -> dict[str, object]:
@@ -71,8 +60,8 @@ def _slot_line(info: SlotInfo, at_ns: int | None) -> str:
     return f"v{info.version}{size}  {shown_s(max(0.0, age_s))} {'ago' if at_ns is None else 'old'}"
 
 
-def print_datum(datum: object, *, out: str | None, as_json: bool) -> None:
-    """Print or save a datum.
+def datum_output(datum: object, *, out: str | None) -> Output | int:
+    """Return a datum to print, or save it to the file `out`.
 
     Raises:
         ConfigError: The ending of `out` is unknown, or cannot hold the datum.
@@ -81,8 +70,52 @@ def print_datum(datum: object, *, out: str | None, as_json: bool) -> None:
 
     if out:
         print(showing.save(datum, out))
-    elif as_json:
-        print_json(showing.plain(datum))
-    else:
-        for line in showing.lines(datum):
-            print(line)
+        return 0
+    return Output(lambda: showing.plain(datum), lambda: print(*showing.lines(datum), sep="\n"))
+
+
+@contextmanager
+def named_if_missing(world: WorldContext | PastContext, slot: tuple[str, str]) -> Iterator[None]:
+    """Report a null datum in the terms of the command line.
+
+    Args:
+        world: Its world context, present or past.
+        slot: Its entity and aspect.
+
+    Raises:
+        NullDatumError: It is null.
+    """
+    try:
+        yield
+    except NullDatumError as error:
+        raise missing(world, slot, error.reason) from error
+
+
+def missing(
+    world: WorldContext | PastContext, slot: tuple[str, str], reason: str = ""
+) -> NullDatumError:
+    """Return the error for a datum that is not there."""
+    entity, aspect = slot
+    reason = reason or NullReason.NEVER_SET.value
+    close = ""
+    if reason == NullReason.NEVER_SET.value:
+        close = suggestion(f"{entity}/{aspect}", _likely(world, entity, aspect))
+    return NullDatumError(
+        f"{world.name}:{entity}/{aspect} is null ({reason}); enact world tree"
+        f" {world.name} shows what there is{close}",
+        reason=reason,
+    )
+
+
+def _likely(world: WorldContext | PastContext, entity: str, aspect: str) -> list[str]:
+    """Return the names of data of the same entity, or of the same aspect."""
+    try:
+        infos = world.list_slots()
+    except EnactError:
+        return []  # the error itself is reported anyway
+    names = (
+        f"{info.entity}/{info.aspect}"
+        for info in infos
+        if not info.null_reason and (info.entity.name == entity or info.aspect == aspect)
+    )
+    return list(itertools.islice(names, COMPARED_MAX))

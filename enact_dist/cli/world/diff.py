@@ -7,36 +7,25 @@ aspect may be apart.  All else is compared exactly, dataclasses field by field.
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import time
 from collections import Counter
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from enact_dist.cli.text.output import print_json, print_table, shown_bytes, shown_s
-from enact_dist.cli.text.times import MOMENT_HELP, moment
-from enact_dist.cli.verbs import (
-    DIFFERENT,
-    DONE,
-    add_reader,
-    add_verb,
-    cell_target,
-    entities,
-    is_endpoint,
-    open_cell,
-    see_modules,
-)
+from enact_dist.cli.target import cell_target, is_endpoint, open_cell, see_modules
+from enact_dist.cli.text.output import print_table, shown_bytes, shown_s
+from enact_dist.cli.verbs import DIFFERENT, DONE, Output
 from enact_dist.errors import ConfigError
 from enact_dist.terms import Aspect
 
 if TYPE_CHECKING:
+    import argparse
     from collections.abc import Iterable, Mapping
 
     from enact_dist.access.arguments import When
     from enact_dist.access.snapshot import SlotInfo
-    from enact_dist.cli.verbs import Verb
     from enact_dist.compare.diff import Comparison, Diff
-    from enact_dist.comparing import Tolerance
     from enact_dist.config.types import CellConfig
     from enact_dist.world.cell import Cell
     from enact_dist.world.context import WorldContext
@@ -46,75 +35,16 @@ ROWS_SHOWN_MAX: Final = 12
 """So many slots that only one side has are listed; more are counted by aspect."""
 
 
-def add_diff(verbs: argparse._SubParsersAction[Verb]) -> None:
-    """Add the verb to the noun `world`."""
-    diff = add_verb(
-        verbs, "diff", "compare two world contexts: exit 0 if equal, 4 if they differ",
-        run=show_diff,
-        example="enact world diff training online\n"
-        "enact world diff online what_if 'tray/**' --aspect surface\n"
-        "enact world diff online online --at1 -30s --tolerance shift_mm=0.5",
-    )  # fmt: skip
-    diff.add_argument("left", metavar="WORLD1", help="name of a world context")
-    diff.add_argument("right", metavar="WORLD2", help="another one, or the same at another time")
-    diff.add_argument(
-        "entities",
-        nargs="?",
-        metavar="PATTERN",
-        type=entities,
-        default="**",
-        help="only entities whose names match (default: all)",
-    )
-    diff.add_argument("--aspect", action="append", metavar="NAME", help="only these aspects")
-    diff.add_argument("--at1", type=moment, metavar="TIME", help=f"the first as of {MOMENT_HELP}")
-    diff.add_argument("--at2", type=moment, metavar="TIME", help="the second as of a moment")
-    diff.add_argument(
-        "--tolerance",
-        action="append",
-        type=tolerance,
-        default=[],
-        metavar="[ASPECT=]X",
-        help="how far numbers may be apart, in their unit, or in percent of the larger (1%%);"
-        " wins over cell.toml, and holds for every aspect that has none where none is named",
-    )
-    diff.add_argument("--all", action="store_true", help="list every slot that only one side has")
-    diff.add_argument(
-        "--trust",
-        action="store_true",
-        help="run every module that a `compare` in cell.toml names, not only those in the packages"
-        " of the cell's actors (caution: this runs code that cell.toml chooses)",
-    )
-    add_reader(diff)
-
-
-def tolerance(text: str) -> tuple[str, Tolerance]:
-    """Read ``[ASPECT=]X`` or ``[ASPECT=]X%``; an `argparse` type."""
-    from enact_dist.comparing import Tolerance
-
-    aspect, _, figure = text.rpartition("=")
-    try:
-        if figure.endswith("%"):
-            return aspect, Tolerance(relative=float(figure[:-1]) / 100.0)
-        return aspect, Tolerance(absolute=float(figure))
-    except ValueError:
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is no tolerance; write 0.5, 1%, shift_mm=0.5 or shift_mm=1%"
-        ) from None
-
-
-def show_diff(arguments: argparse.Namespace) -> int:
-    """Print how two world contexts differ."""
-    configured = configured_aspects(arguments)
-    with open_cell(arguments) as cell:
-        left = _context(cell, arguments.left, arguments.at1)
-        right = _context(cell, arguments.right, arguments.at2)
-        aspects = _aspects(arguments, cell, configured)
-        found = left.diff(right, arguments.entities, aspects)
-    if arguments.json:
-        print_json(found.to_json())
-    else:
-        _print_diff(found, every=arguments.all)
-    return DIFFERENT if found else DONE
+def show_diff(options: argparse.Namespace) -> Output:
+    """Say how two world contexts differ."""
+    configured = configured_aspects(options)
+    with open_cell(options) as cell:
+        left = _context(cell, options.left, options.at1)
+        right = _context(cell, options.right, options.at2)
+        aspects = _aspects(options, cell, configured)
+        found = left.diff(right, options.entities, aspects)
+    show = partial(_print_diff, found, every=options.all)
+    return Output(found.to_json, show, status=DIFFERENT if found else DONE)
 
 
 def _context(cell: Cell, name: str, at: When | None) -> WorldContext | PastContext:
@@ -125,7 +55,7 @@ def _context(cell: Cell, name: str, at: When | None) -> WorldContext | PastConte
 # ---------------------------------------------------------------- how aspects are compared
 
 
-def configured_aspects(arguments: argparse.Namespace) -> dict[str, Aspect[Any]]:
+def configured_aspects(options: argparse.Namespace) -> dict[str, Aspect[Any]]:
     """Return the aspects whose comparators the `cell.toml` names; none of an endpoint's cell.
 
     Raises:
@@ -133,21 +63,21 @@ def configured_aspects(arguments: argparse.Namespace) -> dict[str, Aspect[Any]]:
     """
     from enact_dist.config.read import load_config
 
-    target = cell_target(arguments)
+    target = cell_target(options)
     if is_endpoint(target):
         return {}
     config = load_config(target)
     see_modules(config.path, runs_cell=False)
-    allowed = dict(arguments.tolerance)
+    allowed = dict(options.tolerance)
     wanted = [
         entry
         for entry in config.aspects
         if entry.compare
         and entry.name not in allowed
-        and (not arguments.aspect or entry.name in arguments.aspect)
+        and (not options.aspect or entry.name in options.aspect)
     ]
     for entry in wanted:
-        if not arguments.trust and not _is_of_actors(entry.compare, config):
+        if not options.trust and not _is_of_actors(entry.compare, config):
             raise ConfigError(
                 f"{config.path}: [aspects.{entry.name}] compare = {entry.compare!r} would run a"
                 " module outside the packages of the cell's actors; if you trust the author of the"
@@ -197,12 +127,12 @@ def load_aspect(name: str, target: str) -> Aspect[Any]:
 
 
 def _aspects(
-    arguments: argparse.Namespace, cell: Cell, configured: Mapping[str, Aspect[Any]]
+    options: argparse.Namespace, cell: Cell, configured: Mapping[str, Aspect[Any]]
 ) -> list[Aspect[Any] | str]:
     """Return what to compare: each aspect with the comparator that holds for it."""
-    tolerances = dict(arguments.tolerance)
+    tolerances = dict(options.tolerance)
     registered = [name for name, (fingerprint, _) in cell.aspects().items() if fingerprint]
-    names = arguments.aspect or sorted(registered)
+    names = options.aspect or sorted(registered)
     unknown = [name for name in tolerances if name and name not in names]
     if unknown:
         compared = ", ".join(names) or "none"

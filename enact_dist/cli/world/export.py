@@ -11,66 +11,40 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from enact_dist.cli.record import COMPRESSIONS, shows_of
-from enact_dist.cli.text.output import print_json, shown_bytes
-from enact_dist.cli.text.times import MOMENT_HELP, moment
-from enact_dist.cli.verbs import DONE, add_reader, add_verb, add_world, open_cell, pair
+from enact_dist.cli.record import shows_of
+from enact_dist.cli.text.output import shown_bytes
+from enact_dist.cli.verbs import Output
 from enact_dist.errors import ConfigError, EnactError, ProtocolError
 from enact_dist.terms import checked_name
 
 if TYPE_CHECKING:
     import argparse
 
-    from enact_dist.cli.verbs import Verb
     from enact_dist.recording.exact import Recorded
+    from enact_dist.world.cell import Cell
     from enact_dist.world.context import WorldContext
 
 
-def add_export(verbs: argparse._SubParsersAction[Verb]) -> None:
-    """Add the verb to the noun `world`."""
-    export = add_verb(
-        verbs, "export", "write one world context, all of one moment, into a file or folder",
-        run=export_world,
-        example="enact world export online --out online.mcap\n"
-        "enact world export training --at -10min --out training/",
-    )  # fmt: skip
-    add_world(export)
-    export.add_argument(
-        "--out", metavar="FILE|FOLDER", required=True, help="a new FILE.mcap, or a new folder"
-    )
-    export.add_argument("--at", type=moment, metavar="TIME", help=f"as of {MOMENT_HELP}")
-    export.add_argument(
-        "--shows", action="append", type=pair, metavar="ASPECT=KIND", help="as for enact record"
-    )
-    export.add_argument("--compress", choices=COMPRESSIONS, default="zstd", help="of an .mcap file")
-    add_reader(export)
-
-
-def export_world(arguments: argparse.Namespace) -> int:
+def export_world(cell: Cell, options: argparse.Namespace) -> Output:
     """Write the context and say how much it was."""
     from enact_dist import recording
     from enact_dist.access.arguments import stamp_of
 
-    with open_cell(arguments) as cell:
-        world = cell.world(arguments.world)
-        at_ns = stamp_of(arguments.at) if arguments.at is not None else 0
-        if Path(arguments.out).suffix == ".mcap":
-            done = recording.export_world(
-                world,
-                arguments.out,
-                at_ns=at_ns,
-                shows=shows_of(arguments),
-                compression=arguments.compress,
-            )
-            facts = {"path": done.path, "data": done.versions, "size_bytes": done.size_bytes}
-        else:
-            facts = _into_folder(world, Path(arguments.out).expanduser(), at_ns)
-    if arguments.json:
-        print_json(facts)
+    world = cell.world(options.world)
+    at_ns = stamp_of(options.at) if options.at is not None else 0
+    if Path(options.out).suffix == ".mcap":
+        done = recording.export_world(
+            world,
+            options.out,
+            at_ns=at_ns,
+            shows=shows_of(options),
+            compression=options.compress,
+        )
+        facts = {"path": done.path, "data": done.versions, "size_bytes": done.size_bytes}
     else:
-        size = shown_bytes(int(str(facts["size_bytes"])))
-        print(f"{arguments.world}: {facts['data']} data, {size} in {facts['path']}")
-    return DONE
+        facts = _into_folder(world, Path(options.out).expanduser(), at_ns)
+    size = shown_bytes(int(str(facts["size_bytes"])))
+    return Output(facts, f"{options.world}: {facts['data']} data, {size} in {facts['path']}")
 
 
 def _into_folder(world: WorldContext, folder: Path, at_ns: int) -> dict[str, object]:

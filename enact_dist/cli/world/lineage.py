@@ -2,27 +2,18 @@
 
 from __future__ import annotations
 
-import argparse
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.cli.text.output import print_json, print_tree, shown_s
-from enact_dist.cli.verbs import (
-    DONE,
-    NOUNS,
-    add_reader,
-    add_verb,
-    add_world,
-    open_cell,
-    slot_version,
-    whole,
-)
+from enact_dist.cli.arguments import READER, WORLD, counted, slot_version
+from enact_dist.cli.target import open_cell
+from enact_dist.cli.text.output import Branch, print_tree, shown_s
+from enact_dist.cli.verbs import NOUNS, Option, Output, Verb, flag, option
 from enact_dist.world.lineage import FORGOTTEN, NULL, UNKNOWN
 
 if TYPE_CHECKING:
+    import argparse
     from collections.abc import Iterable, Sequence
 
-    from enact_dist.cli.verbs import Verb
     from enact_dist.world.lineage import CauseTree, EffectTree, Made
 
     Tree = CauseTree | EffectTree
@@ -40,66 +31,52 @@ _KIND: Final = {
 }
 
 
-def add_to(nouns: argparse._SubParsersAction[Verb]) -> None:
-    """Add the two verbs, which have no noun."""
-    why = add_verb(
-        nouns, "why", NOUNS["why"].summary,
-        run=show_causes,
-        example="enact why online system/deviation\n"
-        "enact why online system/deviation@12 --depth 5 --keep incident-7",
+def _options(what: str, *more: Option) -> tuple[Option, ...]:
+    return (
+        WORLD,
+        option("slot", "ENTITY/ASPECT[@VERSION]",
+               "which datum; the newest version unless one is named", type=slot_version),
+        counted("--depth", f"steps (default: {DEPTH})", DEPTH),
+        flag("--all", f"show {what} that are alike one by one"),
+        *READER,
+        *more,
     )  # fmt: skip
-    _add_arguments(why, "causes")
-    why.add_argument(
-        "--keep", metavar="LABEL", help="keep the versions of the tree until the label is released"
-    )
-    impact = add_verb(
-        nouns, "impact", NOUNS["impact"].summary,
-        run=show_effects,
-        example="enact impact training view/milk_carton/0/cloud",
-    )  # fmt: skip
-    _add_arguments(impact, "effects")
 
 
-def _add_arguments(verb: Verb, what: str) -> None:
-    add_world(verb)
-    verb.add_argument(
-        "slot",
-        metavar="ENTITY/ASPECT[@VERSION]",
-        type=slot_version,
-        help="which datum; the newest version unless one is named",
-    )
-    verb.add_argument(
-        "--depth", type=whole, default=DEPTH, metavar="N", help=f"steps (default: {DEPTH})"
-    )
-    verb.add_argument("--all", action="store_true", help=f"show {what} that are alike one by one")
-    add_reader(verb)
+_PIN: Final = option("--pin", "LABEL", "pin the versions of the tree until `enact world unpin`")
+VERBS: Final = (
+    Verb(
+        "why", NOUNS["why"].summary, "show_causes",
+        "enact why online system/deviation\n"
+        "enact why online system/deviation@12 --depth 5 --pin incident-7",
+        _options("causes", _PIN),
+    ),
+    Verb(
+        "impact", NOUNS["impact"].summary, "show_effects",
+        "enact impact training view/milk_carton/0/cloud",
+        _options("effects"),
+    ),
+)  # fmt: skip
 
 
-def show_causes(arguments: argparse.Namespace) -> int:
-    """Print the tree of causes of one version."""
-    entity, aspect, version = arguments.slot
-    with open_cell(arguments, observer=not arguments.keep) as cell:
-        tree = cell.why(arguments.world, entity, aspect, version, depth=arguments.depth)
-        if arguments.keep:
-            cell.pin(arguments.keep, (one for one in tree.walk() if one.known))
-        _print(tree, arguments)
-    return DONE
+def show_causes(options: argparse.Namespace) -> Output:
+    """Draw the tree of causes of one version."""
+    with open_cell(options, observer=not options.pin) as cell:
+        tree = cell.why(options.world, *options.slot, depth=options.depth)
+        if options.pin:
+            cell.pin(options.pin, (one for one in tree.walk() if one.known))
+    return _answer(tree, options)
 
 
-def show_effects(arguments: argparse.Namespace) -> int:
-    """Print the tree of effects of one version."""
-    entity, aspect, version = arguments.slot
-    with open_cell(arguments) as cell:
-        tree = cell.impact(arguments.world, entity, aspect, version, depth=arguments.depth)
-        _print(tree, arguments)
-    return DONE
+def show_effects(options: argparse.Namespace) -> Output:
+    """Draw the tree of effects of one version."""
+    with open_cell(options) as cell:
+        return _answer(cell.impact(options.world, *options.slot, depth=options.depth), options)
 
 
-def _print(tree: Tree, arguments: argparse.Namespace) -> None:
-    if arguments.json:
-        print_json(facts_of(tree))
-    else:
-        print_tree(drawn(tree, alike_min=0 if arguments.all else ALIKE_MIN))
+def _answer(tree: Tree, options: argparse.Namespace) -> Output:
+    alike_min = 0 if options.all else ALIKE_MIN
+    return Output(lambda: facts_of(tree), lambda: print_tree(drawn(tree, alike_min=alike_min)))
 
 
 def facts_of(one: Tree) -> dict[str, object]:
@@ -129,19 +106,7 @@ def facts_of(one: Tree) -> dict[str, object]:
 # ---------------------------------------------------------------- lines for people
 
 
-@dataclass(slots=True)
-class Line:
-    """One line of the drawn tree, and those below it."""
-
-    label: str
-    children: dict[str, Line] = field(default_factory=dict)
-
-    def add(self, line: Line) -> None:
-        """Put a line below this one."""
-        self.children[str(len(self.children))] = line
-
-
-def drawn(tree: Tree, *, alike_min: int = ALIKE_MIN) -> Line:
+def drawn(tree: Tree, *, alike_min: int = ALIKE_MIN) -> Branch:
     """Return the lines of a tree.
 
     Args:
@@ -152,8 +117,8 @@ def drawn(tree: Tree, *, alike_min: int = ALIKE_MIN) -> Line:
     return _line_of([tree], alike_min)
 
 
-def _line_of(alike: Sequence[Tree], alike_min: int) -> Line:
-    line = Line(_label_of_one(alike[0]) if len(alike) == 1 else _label_of_many(alike))
+def _line_of(alike: Sequence[Tree], alike_min: int) -> Branch:
+    line = Branch(_label_of_one(alike[0]) if len(alike) == 1 else _label_of_many(alike))
     groups: dict[tuple[object, ...], list[Tree]] = {}
     for child in _once(child for one in alike for child in one.children):
         groups.setdefault(_likeness(child), []).append(child)
@@ -165,13 +130,13 @@ def _line_of(alike: Sequence[Tree], alike_min: int) -> Line:
             for one in group:
                 line.add(_line_of([one], alike_min))
     if repeated:
-        line.add(Line(f"and, shown elsewhere: {', '.join(_names_of(repeated, alike_min))}"))
+        line.add(Branch(f"and, shown elsewhere: {', '.join(_names_of(repeated, alike_min))}"))
     left_out = sum(one.left_out for one in alike)
     if left_out:
-        line.add(Line(f"… and {left_out} further data, more than are named"))
+        line.add(Branch(f"… and {left_out} further data, more than are named"))
     unfollowed = sum(one.unfollowed for one in alike)
     if unfollowed:
-        line.add(Line(f"… {unfollowed} more steps, with a larger --depth"))
+        line.add(Branch(f"… {unfollowed} more steps, with a larger --depth"))
     return line
 
 

@@ -9,18 +9,10 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from enact_dist.access.watch import Watch
+from enact_dist.cli.target import open_cell
 from enact_dist.cli.text.output import print_json_line, print_table, shown_bytes, shown_s
-from enact_dist.cli.text.rates import WINDOW_S, Rates, Sample
-from enact_dist.cli.verbs import (
-    DONE,
-    add_reader,
-    add_verb,
-    add_world,
-    entities,
-    open_cell,
-    seconds,
-    whole,
-)
+from enact_dist.cli.text.rates import Rates, Sample
+from enact_dist.cli.verbs import DONE
 from enact_dist.config.table import suggestion
 from enact_dist.core.protocol.datum import Slot
 from enact_dist.errors import LinkError, ProtocolError, ShardUnreachableError
@@ -35,7 +27,6 @@ if TYPE_CHECKING:
     from enact_dist.access.session import Session
     from enact_dist.access.watch import Change
     from enact_dist.cli.text.rates import Tally
-    from enact_dist.cli.verbs import Verb
     from enact_dist.world.cell import Cell
     from enact_dist.world.context import WorldContext
     from enact_dist.world.version_data import Retained
@@ -50,66 +41,21 @@ ONE_LINE_MAX: Final = 80
 """A datum of so few lines and characters stands behind its change, any other one below it."""
 
 
-def add_watch(verbs: argparse._SubParsersAction[Verb]) -> None:
-    """Add the verb to the noun `world`."""
-    watch = add_verb(
-        verbs, "watch", "print the present data, then every change, until Ctrl-C", run=watch_world,
-        example="enact world watch online 'tray/**' --aspect surface\n"
-        "enact world watch online robot --data\n"
-        "enact world watch online 'camera/*' --stats --seconds 10",
-    )  # fmt: skip
-    add_world(watch)
-    watch.add_argument(
-        "pattern",
-        metavar="PATTERN",
-        type=entities,
-        nargs="?",
-        default="**",
-        help="of entities (default: all)",
-    )
-    watch.add_argument(
-        "--aspect",
-        action="append",
-        metavar="NAME",
-        help="watch only these aspects, from the moment a shard knows them (repeatable)",
-    )
-    what = watch.add_mutually_exclusive_group()
-    what.add_argument(
-        "--data", action="store_true", help="also print the data; of large arrays, a summary"
-    )
-    what.add_argument(
-        "--stats",
-        action="store_true",
-        help="print rate, period, jitter, delay since capture, size and bandwidth of each datum"
-        f" over the last {WINDOW_S:.0f} s, and at the end over the whole run",
-    )
-    watch.add_argument(
-        "--every",
-        type=seconds,
-        default=1.0,
-        metavar="S",
-        help="how often --stats prints (default: 1)",
-    )
-    watch.add_argument("--seconds", type=seconds, metavar="S", help="leave after S seconds")
-    watch.add_argument("--count", type=whole, metavar="N", help="leave after N changes")
-    add_reader(watch)
-
-
-def watch_world(arguments: argparse.Namespace) -> int:
+def watch_world(options: argparse.Namespace) -> int:
     """Print changes as they arrive, until a signal or one of the limits ends the watch."""
-    with StopSignals() as stop, open_cell(arguments) as cell:
-        world = cell.world(arguments.world)
-        aspects = tuple(dict.fromkeys(arguments.aspect or ()))
+    with StopSignals() as stop, open_cell(options) as cell:
+        world = cell.world(options.world)
+        aspects = tuple(dict.fromkeys(options.aspect or ()))
         _tell_unknown(aspects, cell)
-        shown: _Display = _Lines(world, arguments)
-        if arguments.stats:
-            shown = _Statistics(world, arguments)
+        shown: _Display = _Lines(world, options)
+        if options.stats:
+            shown = _Statistics(world, options)
         client = world.session.client
-        with Watch(client, (world.name,), (arguments.pattern,), aspects) as watch:
+        with Watch(client, (world.name,), (options.pattern,), aspects) as watch:
             begun_s = time.monotonic()
-            if arguments.stats:
+            if options.stats:
                 shown.begin(_here(watch))
-            for changes in _coming(watch, arguments, stop):
+            for changes in _coming(watch, options, stop):
                 shown.show(changes)
             shown.end(time.monotonic() - begun_s)
     return DONE
@@ -133,12 +79,10 @@ def _here(watch: Watch) -> Iterator[Change]:
         yield change
 
 
-def _coming(
-    watch: Watch, arguments: argparse.Namespace, stop: StopSignals
-) -> Iterator[list[Change]]:
+def _coming(watch: Watch, options: argparse.Namespace, stop: StopSignals) -> Iterator[list[Change]]:
     """Yield the changes that have come, none at times, until a signal or until it is enough."""
-    left = arguments.count if arguments.count is not None else math.inf
-    ends_s = time.monotonic() + (arguments.seconds or math.inf)
+    left = options.count if options.count is not None else math.inf
+    ends_s = time.monotonic() + (options.seconds or math.inf)
     while left and not stop.event.is_set():
         wait_s = ends_s - time.monotonic()
         if wait_s <= 0.0:
@@ -208,9 +152,9 @@ def _wanted(changes: Iterable[Change]) -> dict[Wanted, Change]:
 class _Lines:
     """One line per change, and its datum where that is asked for."""
 
-    def __init__(self, world: WorldContext, arguments: argparse.Namespace) -> None:
+    def __init__(self, world: WorldContext, options: argparse.Namespace) -> None:
         self._session = world.session
-        self._as_json, self._with_data = arguments.json, arguments.data
+        self._as_json, self._with_data = options.json, options.data
         self._seen = _Seen()
 
     def begin(self, changes: Iterable[Change]) -> None:
@@ -316,9 +260,9 @@ def _line(change: Change) -> str:
 class _Statistics:
     """Rates, periods, delays, sizes and bandwidths, now and then and at the end."""
 
-    def __init__(self, world: WorldContext, arguments: argparse.Namespace) -> None:
+    def __init__(self, world: WorldContext, options: argparse.Namespace) -> None:
         self._world, self._session = world.name, world.session
-        self._as_json, self._every_s = arguments.json, arguments.every
+        self._as_json, self._every_s = options.json, options.every
         self._rates = Rates()
         self._seen = _Seen()
         self._sizes: dict[Slot, int] = {}

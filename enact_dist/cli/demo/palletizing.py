@@ -1,0 +1,91 @@
+"""`enact demo palletizing`: the application of ENACT 4.2, simulated or on real recordings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.errors import ConfigError
+
+if TYPE_CHECKING:
+    import argparse
+
+_EXTRA: Final = ("open3d", "scipy", "cv2")
+"""Modules of the `actors` extra, which the core does without."""
+
+
+def run_palletizing(options: argparse.Namespace) -> int:
+    """Run the demonstration that the options ask for."""
+    _refuse_mixture(options)
+    try:
+        return _run(options)
+    except ImportError as error:
+        if (error.name or "").partition(".")[0] in _EXTRA or ".so" in str(error):
+            raise _missing(error) from error
+        raise
+
+
+def _run(options: argparse.Namespace) -> int:
+    out: Path = options.out or Path("demo_out")
+    if options.check_net:
+        return _check_net(options.check_net, out)
+    if options.views:
+        from actors.palletizing.real_input import run_views
+
+        return run_views(options.views, out)
+    if options.model:
+        from actors.palletizing.real_input import run_match
+
+        return run_match(options.model, options.scene, out)
+    if options.cell:
+        from actors.palletizing.demo_packing import watch_packing
+
+        return watch_packing(options.cell, out=out)
+    from actors.palletizing.demo_packing import run_packing
+
+    names = ("packages", "seed", "speed")
+    given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
+    return run_packing(out=out, keep_running=options.keep_running, **given)
+
+
+def _check_net(file: Path, out: Path) -> int:
+    from actors.palletizing.net_check import check_net
+    from actors.palletizing.nets import NetError
+
+    try:
+        print(check_net(file, out))
+    except (NetError, OSError) as error:
+        raise ConfigError(str(error)) from error
+    return 0
+
+
+def _refuse_mixture(options: argparse.Namespace) -> None:
+    if (options.model is None) != (options.scene is None):
+        raise ConfigError("--model and --scene belong together: the model is found in the scene")
+    if options.views and options.model:
+        raise ConfigError("--views trains, --model and --scene find: run them one after the other")
+    simulated = [
+        name
+        for name in ("packages", "seed", "speed", "keep_running")
+        if getattr(options, name) not in {None, False}
+    ]
+    option = f"--{simulated[0].replace('_', '-')}" if simulated else ""
+    if options.check_net and (option or options.cell or options.views or options.model):
+        raise ConfigError("--check-net only checks a file; it goes with --out and no other option")
+    if options.cell and (options.views or options.model):
+        raise ConfigError("--cell watches a cell that runs; recordings need none")
+    if options.cell and option:
+        raise ConfigError(f"{option} can only be set when the cell is started, not with --cell")
+    if option and (options.views or options.model):
+        raise ConfigError(f"{option} belongs to the simulated sensor, not to real recordings")
+
+
+def _missing(error: ImportError) -> ConfigError:
+    if ".so" in str(error):
+        return ConfigError(
+            f"the demo cannot load a shared library ({error}); enact doctor names the package"
+        )
+    return ConfigError(
+        f"the demo needs {error.name}, which is not installed; install the actors extra:"
+        " pip install -e '.[actors]' in the clone of enact-dist"
+    )

@@ -1,0 +1,118 @@
+"""`enact demo workcell`: the application of ENACT 4.1, simulated or on real pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from enact_dist.errors import ConfigError
+
+if TYPE_CHECKING:
+    import argparse
+
+_EXTRA: Final = ("cv2", "scipy", "numba", "mujoco", "ompl", "ruckig")
+"""Modules of the `workcell` extra, which the core does without."""
+_CHOICES: Final = ("scenario", "seed", "seconds", "voxel_m", "source")
+
+
+def run_workcell(options: argparse.Namespace) -> int:
+    """Run the demonstration that the options ask for."""
+    try:
+        return _run(options)
+    except ImportError as error:
+        if (error.name or "").partition(".")[0] in (*_EXTRA, "mcap", "foxglove_schemas_protobuf"):
+            raise ConfigError(
+                f"the demo needs {error.name}, which is not installed; install its extras:"
+                " pip install -e '.[workcell,record]' in the clone of enact-dist"
+            ) from error
+        raise
+
+
+def _run(options: argparse.Namespace) -> int:
+    out: Path = options.out or Path("workcell_out")
+    _refuse_mixture(options)
+    if options.cameras:
+        return _run_folder(options, out)
+    from actors.workcell.demo import record_views, run_demo
+    from actors.workcell.demo_cell import options_of
+    from actors.workcell.demo_options import Options
+
+    if options.cell:
+        out.mkdir(parents=True, exist_ok=True)
+        return run_demo(options_of(options.cell, out, quiet=options.json))
+
+    given: dict[str, Any] = {
+        name: getattr(options, name, None)
+        for name in _CHOICES
+        if getattr(options, name, None) is not None
+    }
+    if options.live and options.play:
+        raise ConfigError("--live draws the images that --play plays; leave out one of both")
+    if options.live:
+        given["source"] = "live"
+    if options.play:
+        given["source"] = f"playback+robot:{options.play.resolve()}"
+    chosen = Options(
+        out,
+        embedded=options.embedded,
+        separate=options.separate,
+        quiet=options.json,
+        keep_running=options.keep_running,
+        **given,
+    )
+    if options.record:
+        return record_views(chosen, options.record, options.renderer or "composite")
+    out.mkdir(parents=True, exist_ok=True)
+    return run_demo(chosen)
+
+
+def _run_folder(options: argparse.Namespace, out: Path) -> int:
+    from actors.workcell.folder_pictures import colour_of
+    from actors.workcell.folders import FolderOptions, run_folder
+
+    given: dict[str, Any] = {
+        name: getattr(options, name)
+        for name in ("grid", "unit", "frame")
+        if getattr(options, name) is not None
+    }
+    if options.key is not None:
+        try:
+            given["key"] = colour_of(options.key)
+        except ValueError as error:
+            raise ConfigError(f"--key: {error}") from None
+    wanted = FolderOptions(
+        **given, pixel_distortion=options.distortion == "pixel", quiet=options.json
+    )
+    return run_folder(options.cameras, out, wanted)
+
+
+def _refuse_mixture(options: argparse.Namespace) -> None:
+    if options.renderer and not options.record:
+        raise ConfigError("--renderer belongs to --record DIR; leave it out, or record views first")
+    simulated = (
+        "scenario",
+        "seed",
+        "seconds",
+        "voxel_m",
+        "live",
+        "play",
+        "record",
+        "embedded",
+        "separate",
+    )
+    real = ("grid", "unit", "frame", "key", "distortion")
+    if options.cell:
+        for name in (*simulated, *real, "cameras", "keep_running"):
+            if getattr(options, name) not in {None, False}:
+                raise ConfigError(
+                    f"--{name.replace('_', '-')} is the choice of those who started the cell that"
+                    " --cell names; leave out one of both"
+                )
+    for names, fits, where in (
+        (simulated, not options.cameras, "the simulated cell, not to --cameras"),
+        (real, bool(options.cameras), "--cameras FOLDER"),
+    ):
+        found = [name for name in names if getattr(options, name) not in {None, False}]
+        if found and not fits:
+            option = found[0].replace("_", "-")
+            raise ConfigError(f"--{option} belongs to {where}; leave out one of both")
