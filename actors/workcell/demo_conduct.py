@@ -22,7 +22,7 @@ from actors.workcell.demo_cell import SETUP
 from actors.workcell.scenarios import scenario_of
 from actors.workcell.trace import ONLINE, RECORDED, TRUTH
 from enact_dist import Lock, View, ViewEach, Write
-from enact_dist.actor.running.words import reports_of, tell_reported
+from enact_dist.actor.running.commands import reports_of, send_to
 from enact_dist.config.read import load_config
 from enact_dist.errors import EnactError, ForgottenError, NullDatumError, ShardUnreachableError
 
@@ -351,7 +351,7 @@ class Conductor:
         if not found:
             raise DemoError(f"actor {name} accepts no commands; see {self._running.log}")
         for info, row in found:
-            tell_reported(self._cell, info, row, {"set": {attribute: value}})
+            send_to(self._cell, info, row, {"set": {attribute: value}})
 
     def _pid(self, name: str) -> int:
         """Return the process of an actor, or else of a shard.

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from enact_dist.actor.running.commands import CommandListener
 from enact_dist.actor.running.doing import raised
 from enact_dist.actor.running.group import ANEW, DRAIN_S, ActorGroup, Life
-from enact_dist.actor.running.words import ListeningForWords
 from enact_dist.cli.arguments import pairs
 from enact_dist.cli.target import cell_config, cell_target, is_endpoint, open_cell, see_modules
 from enact_dist.cli.verbs import DONE, exit_status, told
@@ -129,7 +129,7 @@ def _lived(
             life.ready()
             _warn_of_same_name(cell, name)
 
-        with ListeningForWords(made.actor, run, cell, restart):
+        with CommandListener(made.actor, run, cell, restart):
             statistics = _run(run, ready)
     life.over()
     counted = {key: getattr(statistics, key) for key in ("state", "updates", "failures", "refused")}

@@ -6,7 +6,7 @@ import sys
 import time
 from typing import TYPE_CHECKING, Any, Final
 
-from enact_dist.actor.running.words import reports_of, tell_reported
+from enact_dist.actor.running.commands import reports_of, send_to
 from enact_dist.cli.arguments import pairs
 from enact_dist.cli.target import open_cell
 from enact_dist.cli.verbs import DONE, FAILED
@@ -33,7 +33,7 @@ def set_values(options: argparse.Namespace) -> int:
     with open_cell(options, observer=False, actor="enact actor set") as cell:
         status = DONE
         for info, row in _found(cell, options.name):
-            token = tell_reported(cell, info, row, {"set": values})
+            token = send_to(cell, info, row, {"set": values})
             answer = _answer(cell, info.session, options.name, token)
             if answer != "done":
                 where = f"{info.host} pid {info.pid}"
@@ -50,7 +50,7 @@ def restart_actor(options: argparse.Namespace) -> int:
     with open_cell(options, observer=False, actor="enact actor restart") as cell:
         before = _found(cell, options.name)
         for info, row in before:
-            tell_reported(cell, info, row, {"restart": True})
+            send_to(cell, info, row, {"restart": True})
         old = {info.session for info, _ in before}
         end_s = time.monotonic() + RETURN_S
         while time.monotonic() < end_s:

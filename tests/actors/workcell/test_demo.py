@@ -44,7 +44,7 @@ from actors.workcell.trace import ASPECTS, trace_of
 from actors.workcell.unshared import PlainEach, PlainLock, Version
 from enact_dist import Aspect, Entity, Lock, View, Write, local, testing
 from enact_dist.actor.check import check_cell, declarations_of
-from enact_dist.actor.running.words import ACTOR, WORDS
+from enact_dist.actor.running.commands import ACTOR, COMMANDS
 from enact_dist.config.read import load_config
 from enact_dist.errors import ConfigError, MisuseError
 
@@ -272,7 +272,7 @@ def test_a_camera_repeats_its_image_until_its_time_is_over(tmp_path, monkeypatch
         taken = []
 
         def look_at_commands():
-            seen = View(world, ACTOR, WORDS)
+            seen = View(world, ACTOR, COMMANDS)
             taken.append(world.view(seen).get(seen, {}).get(session, {}).get("set"))
             if taken[-1] == {"stuck": "false"}:
                 raise DemoError

@@ -5,19 +5,19 @@ import threading
 from types import SimpleNamespace
 
 from enact_dist import Actor, View
-from enact_dist.actor.running.words import ACTOR, WORDS, ListeningForWords, tell
+from enact_dist.actor.running.commands import ACTOR, COMMANDS, CommandListener, send
 
 
 def test_commands_of_sessions_that_are_gone_do_not_stay(cell):
     """An actor that was killed takes none; the next command drops what is left of it."""
     online = cell.world("online")
-    words = View(online, ACTOR, WORDS)
+    words = View(online, ACTOR, COMMANDS)
 
-    tell(online, {"token": "1"}, session="killed", live=["killed"])
-    tell(online, {"token": "2"}, session="other", live=["other", "killed"])
+    send(online, {"token": "1"}, session="killed", live=["killed"])
+    send(online, {"token": "2"}, session="other", live=["other", "killed"])
     assert set(online.view(words)[words]) == {"killed", "other"}
 
-    tell(online, {"token": "3"}, session="third", live=["other", "third"])
+    send(online, {"token": "3"}, session="third", live=["other", "third"])
     assert set(online.view(words)[words]) == {"other", "third"}
 
 
@@ -35,10 +35,10 @@ def test_what_is_no_command_is_passed_over_and_the_next_one_is_heard(cell):
         answer=told.put,
         doing=SimpleNamespace(between=threading.Lock()),
     )
-    with ListeningForWords(actor, run, cell, restart=None):
+    with CommandListener(actor, run, cell, restart=None):
         for word in (7, "text", {"token": "1", "set": {"gain": "2.5"}}):
-            tell(online, word, session=cell.session, live=[cell.session])
-            view = View(online, ACTOR, WORDS)
+            send(online, word, session=cell.session, live=[cell.session])
+            view = View(online, ACTOR, COMMANDS)
             while word == 7 and cell.session in online.view(view).get(view, {}):
                 continue
         assert told.get(timeout=30.0) == "1 done"

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from enact_dist.world.listings import ActorInfo
 
 ACTOR: Final = Entity("actor")
-WORDS: Final = Aspect("actor_words", dict, Durability.VOLATILE, retention=1)
+COMMANDS: Final = Aspect("actor_words", dict, Durability.VOLATILE, retention=1)
 DONE: Final = "done"
 """Follows the token of an executed command in a report; otherwise the reason follows."""
 ENDS: Final = "ends, to begin anew"
@@ -39,21 +39,23 @@ ENDS: Final = "ends, to begin anew"
 log = logging.getLogger("enact.actor")
 
 
-def words_of(world: WorldContext) -> Write[dict[str, Any]]:
+def commands_of(world: WorldContext) -> Write[dict[str, Any]]:
     """Return the request for the commands to actors, by the session of each."""
-    return Write(world, ACTOR, WORDS)
+    return Write(world, ACTOR, COMMANDS)
 
 
-def tell(world: WorldContext, word: dict[str, Any], *, session: str, live: Iterable[str]) -> None:
+def send(
+    world: WorldContext, command: dict[str, Any], *, session: str, live: Iterable[str]
+) -> None:
     """Give the actor of a session a command; drop those of sessions that are not live.
 
     Raises:
         EnactError: The lock was not granted, or its commit failed.
     """
-    request = words_of(world)
+    request = commands_of(world)
     with Lock(request) as lock:
-        kept = {one: words for one, words in lock.get(request, {}).items() if one in {*live}}
-        lock[request] = {**kept, session: word}
+        kept = {one: its for one, its in lock.get(request, {}).items() if one in {*live}}
+        lock[request] = {**kept, session: command}
 
 
 def reports_of(cell: Cell, name: str) -> list[tuple[ActorInfo, dict[str, Any]]]:
@@ -67,14 +69,14 @@ def reports_of(cell: Cell, name: str) -> list[tuple[ActorInfo, dict[str, Any]]]:
     ]
 
 
-def tell_reported(cell: Cell, info: ActorInfo, row: dict[str, Any], word: dict[str, Any]) -> str:
+def send_to(cell: Cell, info: ActorInfo, row: dict[str, Any], command: dict[str, Any]) -> str:
     """Give a command to an actor that reports; return the token that its answer begins with.
 
     Args:
         cell: Where it runs.
         info: Its session.
         row: Its report, which names the world context in which it reads commands.
-        word: The command: `{"set": values}` or `{"restart": True}`.
+        command: The command: `{"set": values}` or `{"restart": True}`.
 
     Raises:
         EnactError: The lock was not granted, or its commit failed.
@@ -82,11 +84,11 @@ def tell_reported(cell: Cell, info: ActorInfo, row: dict[str, Any], word: dict[s
     token = secrets.token_hex(4)
     live = [one.session for one in cell.actors() if not one.silent]
     world = cell.world(str(row["words_in"]))
-    tell(world, {"token": token, **word}, session=info.session, live=live)
+    send(world, {"token": token, **command}, session=info.session, live=live)
     return token
 
 
-def with_values(actor: Actor, values: dict[str, str]) -> None:
+def set_attributes(actor: Actor, values: dict[str, str]) -> None:
     """Change attributes of an actor, all or none.
 
     Raises:
@@ -107,7 +109,7 @@ def with_values(actor: Actor, values: dict[str, str]) -> None:
         setattr(actor, key, value)
 
 
-class ListeningForWords:
+class CommandListener:
     """Listens for commands to one actor of this process, in a thread; a context manager.
 
     Args:
@@ -125,7 +127,7 @@ class ListeningForWords:
         self._session = self._world.session.client.core.session
         self._watch: Watch | None = None
         self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._listen, name="enact-words", daemon=True)
+        self._thread = threading.Thread(target=self._listen, name="enact-commands", daemon=True)
 
     def __enter__(self) -> None:
         self._thread.start()
@@ -146,7 +148,7 @@ class ListeningForWords:
                 self._closing.wait(5.0)
 
     def _follow(self) -> None:
-        with self._world.watch(ACTOR, WORDS) as watch:
+        with self._world.watch(ACTOR, COMMANDS) as watch:
             self._watch = watch
             while not self._closing.is_set():
                 change = watch.next()
@@ -156,33 +158,33 @@ class ListeningForWords:
                     self._take()
 
     def _take(self) -> None:
-        request = words_of(self._world)
-        seen = View(self._world, ACTOR, WORDS)
+        request = commands_of(self._world)
+        seen = View(self._world, ACTOR, COMMANDS)
         if self._session not in self._world.view(seen).get(seen, {}):
             return
         with Lock(request, wait_s=5.0) as lock:
-            words = dict(lock.get(request, {}))
-            word = words.pop(self._session, None)
-            if words:
-                lock[request] = words
+            commands = dict(lock.get(request, {}))
+            command = commands.pop(self._session, None)
+            if commands:
+                lock[request] = commands
             else:
                 del lock[request]
-        if not isinstance(word, dict):
-            if word is not None:
+        if not isinstance(command, dict):
+            if command is not None:
                 log.warning("%s: an invalid command was ignored", self._run.name)
             return
-        token = str(word.get("token", ""))
-        if word.get("restart"):
+        token = str(command.get("token", ""))
+        if command.get("restart"):
             self._run.answer(f"{token} {ENDS}")
             self._restart()
             return
         try:
-            values = {str(key): str(value) for key, value in dict(word.get("set", {})).items()}
+            values = {str(key): str(value) for key, value in dict(command.get("set", {})).items()}
             with self._run.doing.between:
-                with_values(self._actor, values)
+                set_attributes(self._actor, values)
         except (ConfigError, ValueError, TypeError, AttributeError) as error:
             self._run.answer(f"{token} {error}")
             return
-        told = ", ".join(f"{key} = {value}" for key, value in values.items())
-        log.info("%s: %s, as commanded", self._run.name, told)
+        shown = ", ".join(f"{key} = {value}" for key, value in values.items())
+        log.info("%s: %s, as commanded", self._run.name, shown)
         self._run.answer(f"{token} {DONE}")
