@@ -33,7 +33,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 from enact_dist.core.protocol.messages import Refused, Staged, WriteItem
 from enact_dist.link.clock import Clock, SystemClock
-from enact_dist.link.memory.maps import Pages, Plain, body_of, leftovers, plain_memory
+from enact_dist.link.memory.maps import Pages, PlainMemory, body_of, leftovers, plain_memory
 from enact_dist.link.memory.names import UsedNames
 from enact_dist.link.memory.payload_files import PayloadFiles
 from enact_dist.wire.limits import BODY_BYTES_MAX, PAYLOAD_BYTES_MIN, PAYLOAD_NAME
@@ -76,7 +76,7 @@ class _Draft:
     session: str
     owner: str
     size: int
-    memory: Pages | Plain
+    memory: Pages | PlainMemory
     shared: bool
     touched_ns: int
     have: int = 0
@@ -138,7 +138,7 @@ class PayloadDesk:
         self._opening = tuple(threading.Lock() for _ in range(16))
         self._drafts: dict[str, _Draft] = {}
         self._files = 0
-        self._adopted: dict[str, weakref.ref[Pages | Plain]] = {}
+        self._adopted: dict[str, weakref.ref[Pages | PlainMemory]] = {}
         self._over = UsedNames()
         self._bytes = self._gone = 0
         self._full = 0, 0
@@ -369,11 +369,11 @@ class PayloadDesk:
             return write
         shared = isinstance(memory, Pages)
         body = body_of(memory).toreadonly()
-        # Plain memory has a name only for its writer.
+        # PlainMemory memory has a name only for its writer.
         file = datum.file if shared else ""
         return WriteItem(write.slot, replace(datum, body=body, file=file))
 
-    def _adopt(self, file: str, size: int) -> Pages | Plain | None:
+    def _adopt(self, file: str, size: int) -> Pages | PlainMemory | None:
         """Return the bytes of a complete payload and adopt it; None if there is none."""
         with self._mutex:
             known = self._adopted.get(file)
@@ -400,7 +400,7 @@ class PayloadDesk:
             self._files -= disk is not None
             self._gone += 1
 
-    def _unadopted(self, file: str, gone: weakref.ref[Pages | Plain]) -> None:
+    def _unadopted(self, file: str, gone: weakref.ref[Pages | PlainMemory]) -> None:
         """Forget an adopted payload; a late draft of the same name then ends silently."""
         with self._mutex:
             if self._adopted.get(file) is gone:
