@@ -9,7 +9,7 @@ import pytest
 
 from enact_dist.core.protocol.datum import Datum, LockId, Slot, Token
 from enact_dist.core.protocol.messages import Commit, Refused, Stage, Staged, WriteItem
-from enact_dist.link.memory import payload_desk
+from enact_dist.link.memory import payload_desk, payload_files
 from enact_dist.link.memory.maps import leftovers
 from enact_dist.link.memory.payload_desk import NO_ROOM, PayloadDesk
 from enact_dist.link.memory.shared_folder import SharedFolder
@@ -217,7 +217,7 @@ def test_draft_that_was_given_up_and_comes_again_is_not_counted_for_ever(folder,
         if len(ended) == 1:
             stage(desk)
 
-    monkeypatch.setattr(payload_desk, "os", SimpleNamespace(**{**vars(os), "unlink": unlink}))
+    monkeypatch.setattr(payload_files, "os", SimpleNamespace(**{**vars(os), "unlink": unlink}))
     stage(desk)
     for _ in range(2):
         desk.sweep(lambda _: False, lambda _: False)

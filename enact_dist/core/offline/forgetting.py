@@ -49,7 +49,7 @@ class Going(NamedTuple):
 
 
 @dataclass(slots=True)
-class Plan:
+class PurgePlan:
     """The plan of a purge.
 
     Attributes:
@@ -77,7 +77,7 @@ def planned(
     *,
     now_ns: int,
     begun: Mapping[str, int] | None = None,
-) -> Plan:
+) -> PurgePlan:
     """Return the plan to purge aspects.
 
     Args:
@@ -94,7 +94,7 @@ def planned(
     done = tuple(name for name in begun if all(name in here for here in has.values()))
     names = tuple(name for name in dict.fromkeys([*aspects, *begun]) if name not in done)
     known = frozenset(name for stored in stores.values() for name in _known(stored))
-    plan = Plan(known, names=names, done=done)
+    plan = PurgePlan(known, names=names, done=done)
     left = {shard: [name for name in names if name not in has[shard]] for shard in stores}
     for shard, stored in stores.items():
         plan.obstacles += _undecided(shard, stored, frozenset(left[shard]), stores.keys())

@@ -7,7 +7,7 @@ tests compare the real store with it.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from enact_dist.core.protocol.records import (
     AspectForgotten,
@@ -33,7 +33,7 @@ from enact_dist.core.protocol.records import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Collection, Iterable
 
     from enact_dist.core.protocol.datum import LockId, Slot
     from enact_dist.core.protocol.records import Record
@@ -60,13 +60,13 @@ class Ledger:
             self.take(record)
 
     def take(self, record: Record) -> None:
-        """Let a record count, in place of what it replaces or ends."""
+        """Apply a record: it counts from now on, in place of what it replaces or ends."""
         match record:
             case SlotRecord():
                 self._set(record)
             case HistoryForgotten():
-                for slot, version in record.versions:
-                    self.history.pop((slot, version), None)
+                for version in record.versions:
+                    self.history.pop(version, None)
             case KeptRecord():
                 self.kept[record.label] = record
                 if not record.versions:
@@ -74,16 +74,19 @@ class Ledger:
             case WorldRecord():
                 self.worlds[record.name] = record
             case WorldDropped():
-                self._drop(record)
+                self.worlds.pop(record.name, None)
+                self.dropped[record.name] = record
+                self._delete("context", {record.name})
             case AspectForgotten():
-                self._forget(record)
+                self.aspects.pop(record.name, None)
+                self.forgotten[record.name] = record
+                self._delete("aspect", {record.name})
             case BasesMoved(base=AspectForgotten() as base):
                 self.forgotten[base.name] = base
             case BasesMoved(base=WorldDropped() as base):
                 self.dropped[base.name] = base
             case EntitiesMoved():
-                gone = frozenset(record.entities)
-                self._keep_only(lambda slot: slot.entity not in gone)
+                self._delete("entity", frozenset(record.entities))
             case AspectRecord():
                 self.aspects[record.entry.name] = record
             case SessionRecord():
@@ -113,19 +116,12 @@ class Ledger:
             self.history[old.slot, old.version] = replace(old, history=False, same_as=None)
         self.slots[record.slot] = replace(record, history=False, same_as=None)
 
-    def _drop(self, record: WorldDropped) -> None:
-        self.worlds.pop(record.name, None)
-        self.dropped[record.name] = record
-        self._keep_only(lambda slot: slot.context != record.name)
-
-    def _forget(self, record: AspectForgotten) -> None:
-        self.aspects.pop(record.name, None)
-        self.forgotten[record.name] = record
-        self._keep_only(lambda slot: slot.aspect != record.name)
-
-    def _keep_only(self, stays: Callable[[Slot], bool]) -> None:
-        self.slots = {slot: found for slot, found in self.slots.items() if stays(slot)}
-        self.history = {key: found for key, found in self.history.items() if stays(key[0])}
+    def _delete(self, part: str, names: Collection[str]) -> None:
+        """Delete all states of slots whose `part` is one of `names`."""
+        tables: tuple[dict[Any, SlotRecord], ...] = (self.slots, self.history)
+        for states in tables:
+            for key in [key for key, found in states.items() if getattr(found.slot, part) in names]:
+                del states[key]
 
     def recovered(self, epoch: int) -> Recovered:
         """Return everything as a store gives it back at the start of an epoch."""

@@ -76,7 +76,7 @@ class _Start(NamedTuple):
 
 
 @dataclass(slots=True)
-class Plan:
+class MovePlan:
     """What a rebalance does.
 
     Attributes:
@@ -115,9 +115,9 @@ class Shards:
 
     # ---------------------------------------------------------------- the plan
 
-    def plan(self) -> Plan:
+    def plan(self) -> MovePlan:
         """Return the plan, or the obstacles to one."""
-        plan = Plan()
+        plan = MovePlan()
         plan.obstacles += self._undecided()
         for entity in sorted(self._states):
             self._plan_entity(entity, plan)
@@ -143,7 +143,7 @@ class Shards:
                 plan.first[shard] = tuple(records)
         return plan
 
-    def _plan_entity(self, entity: str, plan: Plan) -> None:
+    def _plan_entity(self, entity: str, plan: MovePlan) -> None:
         holders, owner = self._states[entity], shard_of(entity, self._placement)
         versions = {shard: _versions(slots) for shard, slots in holders.items()}
         if len({frozenset(found) for found in versions.values()}) > 1 or (

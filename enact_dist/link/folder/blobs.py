@@ -192,16 +192,15 @@ class _Check:
         try:
             # Not through the map: there a disk error would kill the process.
             descriptor = os.open(self._path, os.O_RDONLY | os.O_CLOEXEC)
+            try:
+                crc = _crc_of(descriptor)
+            finally:
+                os.close(descriptor)
         except FileNotFoundError:
-            return _damaged(self._path) if zlib.crc32(body) != self._crc else ""
+            crc = zlib.crc32(body)
         except OSError as failure:
             return f"{self._path} cannot be read: {failure.strerror}"
-        try:
-            return _damaged(self._path) if _crc_of(descriptor) != self._crc else ""
-        except OSError as failure:
-            return f"{self._path} cannot be read: {failure.strerror}"
-        finally:
-            os.close(descriptor)
+        return "" if crc == self._crc else _damaged(self._path)
 
 
 def _damaged(path: Path) -> str:

@@ -38,7 +38,7 @@ _RESTORE: Final = (
 _log = logging.getLogger("enact.store")
 
 
-class Found(NamedTuple):
+class FolderFindings(NamedTuple):
     """The findings about a folder before its database is opened."""
 
     mark: Mark | None
@@ -107,7 +107,7 @@ def refuse(path: Path, found: str, remedy: str = _RESTORE) -> NoReturn:
     raise StoreError(f"{path} {found}; the shard does not start: {remedy}", path=str(path))
 
 
-def look_at(folder: Path) -> Found:
+def look_at(folder: Path) -> FolderFindings:
     """Inspect a folder without opening its database.
 
     Raises:
@@ -133,7 +133,7 @@ def look_at(folder: Path) -> Found:
             " whether acknowledged commits are missing at the end",
             _accept(folder, "with what can be read"),
         )
-    return Found(mark, is_new, mark is not None and not mark.same_boot, accepted)
+    return FolderFindings(mark, is_new, mark is not None and not mark.same_boot, accepted)
 
 
 def _accept(folder: Path, what: str, first: str = "") -> str:
@@ -185,7 +185,7 @@ def check_log(folder: Path, *, power_cut: bool) -> None:
     )
 
 
-def check_reach(folder: Path, found: Found, *, batch: int) -> None:
+def check_reach(folder: Path, found: FolderFindings, *, batch: int) -> None:
     """Refuse a database that ends before the batch in the mark.
 
     Args:

@@ -94,7 +94,7 @@ def _holder(held: Path) -> str:
         return "another process"
 
 
-def let_go_of_killed(folder: Path) -> None:
+def remove_killed_backup(folder: Path) -> None:
     """Remove the links of a killed backup of this folder, unless a backup is in progress.
 
     They only cost disk space; a failure to remove them is logged.

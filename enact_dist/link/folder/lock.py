@@ -174,16 +174,12 @@ def check_format(folder: Path, *, is_new: bool) -> None:
             " give the shard an empty folder",
             path=str(path),
         )
+    by, remedy = "an older", "export its data with that one, or give the shard an empty folder;"
     if int(version) > FORMAT:
-        raise StoreError(
-            f"{folder} has store format {version}, this program reads {FORMAT}: it was written by a"
-            " newer enact-dist; install that one again, nothing was changed",
-            path=str(path),
-        )
-    if int(version) < FORMAT:
+        by, remedy = "a newer", "install that one again,"
+    if int(version) != FORMAT:
         raise StoreError(
             f"{folder} has store format {version}, this program reads {FORMAT}: it was written by"
-            " an older enact-dist; export its data with that one, or give the shard an empty"
-            " folder; nothing was changed",
+            f" {by} enact-dist; {remedy} nothing was changed",
             path=str(path),
         )

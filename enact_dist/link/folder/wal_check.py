@@ -184,25 +184,11 @@ def _weights(words: int) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
     One pair of words (x, y) takes (s0, s1) to (s0 + s1 + x, s0 + 2 s1 + x + y); from the last pair
     to the first, each earlier one passes that step once more.
     """
-    step = ((1, 1), (1, 2))
-    power = ((1, 0), (0, 1))
+    step = np.array(((1, 1), (1, 2)), np.uint32)
+    power = np.identity(2, np.uint32)
     on_words = np.empty((2, words), np.uint32)
     for pair in range(words - 2, -1, -2):
-        for row, (first, second) in enumerate(power):
-            on_words[row, pair] = (first + second) & 0xFFFFFFFF
-            on_words[row, pair + 1] = second
-        power = _times(power, step)
-    return on_words, np.array(power, np.uint32)
-
-
-_Matrix = tuple[tuple[int, int], tuple[int, int]]
-
-
-def _times(left: _Matrix, right: _Matrix) -> _Matrix:
-    (a, b), (c, d) = left
-    (e, f), (g, h) = right
-    mask = 0xFFFFFFFF
-    return (
-        ((a * e + b * g) & mask, (a * f + b * h) & mask),
-        ((c * e + d * g) & mask, (c * f + d * h) & mask),
-    )
+        on_words[:, pair] = power.sum(axis=1, dtype=np.uint32)
+        on_words[:, pair + 1] = power[:, 1]
+        power = power @ step
+    return on_words, power

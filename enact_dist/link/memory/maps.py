@@ -76,7 +76,7 @@ class Pages(_Mapped):
     """A map of a file."""
 
 
-class Plain(_Mapped):
+class PlainMemory(_Mapped):
     """Memory of this process alone, freed in the same way as `Pages`.
 
     A `bytearray` would be zeroed while all other threads wait: 50 ms for 100 MB.
@@ -86,7 +86,7 @@ class Plain(_Mapped):
 Kind = TypeVar("Kind", bound=_Mapped)
 
 
-def plain_memory(size: int, *, ended: Callable[[], None] | None = None) -> Plain:
+def plain_memory(size: int, *, ended: Callable[[], None] | None = None) -> PlainMemory:
     """Return `size` bytes (at least 1) of private memory, whose pages appear as they are filled.
 
     Args:
@@ -95,7 +95,7 @@ def plain_memory(size: int, *, ended: Callable[[], None] | None = None) -> Plain
     """
     protection = mmap.PROT_READ | mmap.PROT_WRITE
     address = _map(None, size, protection, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, -1)
-    return _mapped(Plain, address, size, ended)
+    return _mapped(PlainMemory, address, size, ended)
 
 
 def map_file(
@@ -161,7 +161,7 @@ def _mapped(kind: type[Kind], address: int, size: int, ended: Callable[[], None]
     return mapped
 
 
-def body_of(pages: Pages | Plain) -> memoryview:
+def body_of(pages: Pages | PlainMemory) -> memoryview:
     """Return the bytes; the map lasts as long as these or any view of them."""
     return memoryview(pages).cast("B")[: pages.size]
 

@@ -18,18 +18,12 @@ Rules that a change must keep:
 - A client that still has a draft mapped for writing could change it after the commit.  Our client
   hands out read-only arrays from then on and detaches itself some milliseconds later; a hostile one
   of the same user could do worse.
-- In a folder of a group, whose users may write files that the shard makes for them, only the client
-  learns the name of its draft, and names cannot be listed; the draft gets its payload's name when
-  it becomes read-only.  Two gaps remain: a hostile client can change its own payload after the
-  commit, and a user of the group can read payloads whose names he knows, as he can by asking the
-  shard.
 """
 
 from __future__ import annotations
 
 import logging
 import os
-import secrets
 import threading
 import weakref
 from collections import Counter
@@ -39,8 +33,9 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 from enact_dist.core.protocol.messages import Refused, Staged, WriteItem
 from enact_dist.link.clock import Clock, SystemClock
-from enact_dist.link.memory.maps import Pages, Plain, body_of, leftovers, map_file, plain_memory
+from enact_dist.link.memory.maps import Pages, PlainMemory, body_of, leftovers, plain_memory
 from enact_dist.link.memory.names import UsedNames
+from enact_dist.link.memory.payload_files import PayloadFiles
 from enact_dist.wire.limits import BODY_BYTES_MAX, PAYLOAD_BYTES_MIN, PAYLOAD_NAME
 
 if TYPE_CHECKING:
@@ -81,7 +76,7 @@ class _Draft:
     session: str
     owner: str
     size: int
-    memory: Pages | Plain
+    memory: Pages | PlainMemory
     shared: bool
     touched_ns: int
     have: int = 0
@@ -132,7 +127,7 @@ class PayloadDesk:
         clock: Clock | None = None,
     ) -> None:
         self.counters: dict[str, int] = {}
-        self._folder = folder
+        self._disk = None if folder is None else PayloadFiles(folder)
         self._bytes_max = bytes_max
         self._firm = firm
         self._draft_bytes_max = bytes_max if folder is None else DRAFT_BYTES_MAX
@@ -142,9 +137,8 @@ class PayloadDesk:
         self._mutex = threading.RLock()  # reentrant: a destructor may run anywhere
         self._opening = tuple(threading.Lock() for _ in range(16))
         self._drafts: dict[str, _Draft] = {}
-        self._names: dict[str, str] = {}
         self._files = 0
-        self._adopted: dict[str, weakref.ref[Pages | Plain]] = {}
+        self._adopted: dict[str, weakref.ref[Pages | PlainMemory]] = {}
         self._over = UsedNames()
         self._bytes = self._gone = 0
         self._full = 0, 0
@@ -198,7 +192,7 @@ class PayloadDesk:
             if self._drafts.get(file) is not draft:
                 return Staged(file, draft.size, False)  # a late copy, as in `stage`
             if not slice_.size or end <= draft.have:
-                return Staged(file, draft.have, draft.shared, self._names.get(file, ""))
+                return self._staged(file, draft)
             draft.writing += 1
         try:
             body_of(draft.memory)[offset:end] = slice_.body
@@ -209,19 +203,25 @@ class PayloadDesk:
         with self._mutex:
             draft.writing -= 1
             draft.add(offset, end)
-            return Staged(file, draft.have, draft.shared, self._names.get(file, ""))
+            return self._staged(file, draft)
+
+    def _staged(self, file: str, draft: _Draft) -> Staged:
+        name = "" if self._disk is None else self._disk.drafts.get(file, "")
+        return Staged(file, draft.have, draft.shared, name)
 
     def _opened(self, session: str, owner: str, file: str, total: int) -> _Draft | Refused | None:
         """Return a new draft; None if its name has been used meanwhile."""
         small = total <= PAYLOAD_BYTES_MIN  # often many together, and read with the grant
-        shared = self._folder is not None and not small and self._has_room(total)
-        if not shared and self._folder is not None and not small and self._firm:
-            shared = self._displaced(owner, total, shared=True) and self._reserved(total)
-            if not shared:
+        memory: Pages | None = None
+        if self._disk is not None and not small:
+            if self._has_room(total) or (
+                self._firm and self._displaced(owner, total, shared=True) and self._reserved(total)
+            ):
+                memory = self._in_folder(self._disk, file, total)
+            elif self._firm:
                 return self._refused(session, total, self._bytes, self._bytes_max)
-        if self._folder is not None and not shared and not small:
-            self._travels(f"its limit of {self._bytes_max} bytes is reached")
-        memory = self._in_folder(self._folder, file, total) if shared else None
+            else:
+                self._travels(f"its limit of {self._bytes_max} bytes is reached", self._disk.folder)
         if memory is None:
             drafted = self._drafted()
             full = drafted + max(total, PAYLOAD_BYTES_MIN) > self._draft_bytes_max
@@ -317,46 +317,25 @@ class PayloadDesk:
             " arrays and locks that still reference old ones",
         )
 
-    def _in_folder(self, folder: SharedFolder | None, file: str, total: int) -> Pages | None:
+    def _in_folder(self, disk: PayloadFiles, file: str, total: int) -> Pages | None:
         """Return the memory of a new file whose bytes are counted; None if that fails."""
-        assert folder is not None
         try:
-            return self._file_memory(folder, file, total)
+            return disk.make(file, total, partial(self._ended, file, disk, total))
         except OSError as error:
             with self._mutex:
                 self._bytes -= total
                 self._files -= 1
-            self._travels(str(error.strerror or error))
+            self._travels(str(error.strerror or error), disk.folder)
             return None
 
-    def _travels(self, why: str) -> None:
+    def _travels(self, why: str, folder: SharedFolder) -> None:
         """Count a payload outside the folder, and log it; a full folder is logged less often."""
         self._count("payload_fallbacks")
         now_ns = self._clock.monotonic_ns()
-        if self._folder is not None and now_ns >= self._silent_until_ns:
+        if now_ns >= self._silent_until_ns:
             self._silent_until_ns = now_ns + SILENT_NS
             text = "large data go over the network because the shared folder %s takes none: %s"
-            _log.warning(text, self._folder.path, why)
-
-    def _file_memory(self, folder: SharedFolder, file: str, total: int) -> Pages:
-        flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
-        name = file
-        if folder.access.group is not None:
-            name = self._names[file] = f"draft-{secrets.token_hex(16)}"
-        made = os.open(name, flags, 0o600, dir_fd=folder.descriptor)
-        try:
-            os.fchmod(made, folder.access.draft_mode)
-            # No holes: a page that is missing later kills the process that touches it.
-            os.posix_fallocate(made, 0, total)
-            return map_file(
-                made, total, writable=True, ended=partial(self._ended, file, folder, total)
-            )
-        except BaseException:
-            os.unlink(name, dir_fd=folder.descriptor)
-            self._names.pop(file, None)
-            raise
-        finally:
-            os.close(made)
+            _log.warning(text, folder.path, why)
 
     def drop(self, file: str) -> None:
         """Drop a draft, if it exists."""
@@ -390,11 +369,11 @@ class PayloadDesk:
             return write
         shared = isinstance(memory, Pages)
         body = body_of(memory).toreadonly()
-        # Plain memory has a name only for its writer.
+        # PlainMemory memory has a name only for its writer.
         file = datum.file if shared else ""
         return WriteItem(write.slot, replace(datum, body=body, file=file))
 
-    def _adopt(self, file: str, size: int) -> Pages | Plain | None:
+    def _adopt(self, file: str, size: int) -> Pages | PlainMemory | None:
         """Return the bytes of a complete payload and adopt it; None if there is none."""
         with self._mutex:
             known = self._adopted.get(file)
@@ -407,32 +386,21 @@ class PayloadDesk:
             del self._drafts[file]
             self._adopted[file] = weakref.ref(draft.memory, partial(self._unadopted, file))
             self._over.add(file)
-        if draft.shared and self._folder is not None:
-            name, descriptor = self._names.get(file, file), self._folder.descriptor
-            try:
-                os.chmod(name, self._folder.access.file_mode, dir_fd=descriptor)
-                if name != file:
-                    os.rename(name, file, src_dir_fd=descriptor, dst_dir_fd=descriptor)
-                    del self._names[file]
-            except OSError as error:  # another program has cleared the folder
-                _log.warning("payload %s is lost: %s", file, error.strerror)
-                return None
+        if draft.shared and self._disk is not None and not self._disk.publish(file):
+            return None
         self._count("payloads_adopted")
         return draft.memory
 
-    def _ended(self, file: str, folder: SharedFolder | None, counted: int) -> None:
+    def _ended(self, file: str, disk: PayloadFiles | None, counted: int) -> None:
         """Delete a payload without readers, then stop counting its bytes."""
-        if folder is not None and folder.descriptor >= 0:
-            try:
-                os.unlink(self._names.pop(file, file), dir_fd=folder.descriptor)
-            except OSError as error:  # the folder was deleted first
-                _log.info("payload %s: %s", file, error)
+        if disk is not None:
+            disk.unlink(file)
         with self._mutex:
             self._bytes -= counted
-            self._files -= folder is not None
+            self._files -= disk is not None
             self._gone += 1
 
-    def _unadopted(self, file: str, gone: weakref.ref[Pages | Plain]) -> None:
+    def _unadopted(self, file: str, gone: weakref.ref[Pages | PlainMemory]) -> None:
         """Forget an adopted payload; a late draft of the same name then ends silently."""
         with self._mutex:
             if self._adopted.get(file) is gone:
@@ -473,7 +441,7 @@ class PayloadDesk:
                 **self.counters,
                 "payload_files": self._files,
                 "payload_bytes": self._bytes,
-                "payload_bytes_max": self._bytes_max if self._folder is not None else 0,
+                "payload_bytes_max": self._bytes_max if self._disk is not None else 0,
                 "payload_drafts": len(self._drafts),
             }
 

@@ -31,7 +31,7 @@ import stat
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from enact_dist.errors import LinkError
 
@@ -58,38 +58,28 @@ def shared_root() -> Path:
     return Path(given) if given else MEMORY / f"enact-{os.geteuid()}"
 
 
-@dataclass(frozen=True, slots=True)
-class Access:
+class FolderAccess(NamedTuple):
     """Permissions of everything made below a root.
 
     Attributes:
         group: The group that may enter, besides owner and root; None: no group.
+        folder_mode: Mode of a folder: its files inherit the group, which may not list them.
+        socket_mode: Mode of a socket: connecting needs write permission.
+        draft_mode: Mode of a file that clients fill.
+        file_mode: Mode of a file that clients read.
     """
 
     group: int | None
-
-    @property
-    def folder_mode(self) -> int:
-        """Mode of a folder: its files inherit the group, which may not list them."""
-        return 0o700 if self.group is None else 0o2710
-
-    @property
-    def socket_mode(self) -> int:
-        """Mode of a socket: connecting needs write permission."""
-        return 0o600 if self.group is None else 0o660
-
-    @property
-    def draft_mode(self) -> int:
-        """Mode of a file that clients fill."""
-        return 0o600 if self.group is None else 0o660
-
-    @property
-    def file_mode(self) -> int:
-        """Mode of a file that clients read."""
-        return 0o400 if self.group is None else 0o440
+    folder_mode: int = 0o2710
+    socket_mode: int = 0o660
+    draft_mode: int = 0o660
+    file_mode: int = 0o440
 
 
-def _open_root(root: Path, *, make: bool) -> tuple[int, Access]:
+_PRIVATE: Final = FolderAccess(None, 0o700, 0o600, 0o600, 0o400)
+
+
+def _open_root(root: Path, *, make: bool) -> tuple[int, FolderAccess]:
     """Open the root and find out who may use its contents.
 
     Raises:
@@ -118,7 +108,7 @@ def _open_root(root: Path, *, make: bool) -> tuple[int, Access]:
             f" {SHARED_FOLDER_VARIABLE}"
         )
     for_group = chosen and mode & stat.S_IWGRP and not mode & stat.S_IWOTH
-    return opened, Access(found.st_gid if for_group else None)
+    return opened, FolderAccess(found.st_gid) if for_group else _PRIVATE
 
 
 class SharedFolder:
@@ -181,7 +171,7 @@ class SharedFolder:
             os.close(descriptor)
 
 
-def _make(root: int, name: str, access: Access) -> tuple[Access, int]:
+def _make(root: int, name: str, access: FolderAccess) -> tuple[FolderAccess, int]:
     """Make a folder and lock it; set its permissions last."""
     os.mkdir(name, 0o700, dir_fd=root)
     made = os.open(name, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=root)
@@ -192,7 +182,7 @@ def _make(root: int, name: str, access: Access) -> tuple[Access, int]:
             try:
                 os.fchown(made, -1, access.group)
             except PermissionError:  # we are not in that group
-                access = Access(None)
+                access = _PRIVATE
         os.fchmod(made, access.folder_mode)
     except BaseException:
         os.close(made)

@@ -121,11 +121,11 @@ def back_up(folder: Path, into: Path, *, cell: str, shard: str, unix_s: int) -> 
             raise _is_there(into)
         with held_bodies(folder, into) as held, partial_folder(into, ".partial") as partial:
             stored = _copied(folder, held, partial)
-            backup = _told(stored, cell=cell, shard=shard, unix_s=unix_s)
-            told = {name: value for name, value in asdict(backup).items() if name != DIGESTS}
+            backup = _description(stored, cell=cell, shard=shard, unix_s=unix_s)
+            facts = {name: value for name, value in asdict(backup).items() if name != DIGESTS}
             files = digests_of(partial)
-            told[MODES] = _modes(folder, held, files)
-            replace_file(partial / BACKUP_FILE, sealed(told, files), mode=FILE_MODE)
+            facts[MODES] = _modes(folder, held, files)
+            replace_file(partial / BACKUP_FILE, sealed(facts, files), mode=FILE_MODE)
             read_backup(partial)
             _sync(partial)
             if not _renamed(partial, into):
@@ -240,7 +240,7 @@ def _check_bodies(stored: Recovered) -> None:
             raise StoreError(f"{found}; it has version {record.version} of {record.slot}")
 
 
-def _told(stored: Recovered, *, cell: str, shard: str, unix_s: int) -> Backup:
+def _description(stored: Recovered, *, cell: str, shard: str, unix_s: int) -> Backup:
     states = (*stored.history, *stored.slots)
     size = sum(state.datum.size for state in states if state.datum is not None)
     entities = len({state.slot.entity for state in states})
@@ -259,7 +259,7 @@ def _sync(folder: Path) -> None:
 # ---------------------------------------------------------------- restore
 
 
-class Contents(NamedTuple):
+class Manifest(NamedTuple):
     """The contents of a backup's description.
 
     Attributes:
@@ -273,18 +273,18 @@ class Contents(NamedTuple):
     modes: dict[str, str]
 
 
-def read_backup(path: Path) -> Contents:
+def read_backup(path: Path) -> Manifest:
     """Return the description of a backup and of its files.
 
     Raises:
         StoreError: This is no backup, or its description has changed.
     """
-    told, files = read_sealed(path)
+    facts, files = read_sealed(path)
     try:
-        modes = check_modes(told.pop(MODES, {}), files) if files is not None else {}
-        if told.keys() != {field.name for field in dataclasses.fields(Backup)} - {DIGESTS}:
-            raise ValueError(f"it has {', '.join(told)}")
-        return Contents(Backup(**told, digests=files is not None), files, modes)
+        modes = check_modes(facts.pop(MODES, {}), files) if files is not None else {}
+        if facts.keys() != {field.name for field in dataclasses.fields(Backup)} - {DIGESTS}:
+            raise ValueError(f"it has {', '.join(facts)}")
+        return Manifest(Backup(**facts, digests=files is not None), files, modes)
     except (TypeError, ValueError, AttributeError) as failure:
         raise StoreError(
             f"{path} is no backup of a shard, or its {BACKUP_FILE} is damaged ({failure}); copy the"
@@ -338,7 +338,13 @@ def restore(
 
 
 def _put(
-    source: Path, contents: Contents, partial: Path, folder: Path, *, unix_s: int, replace: bool
+    source: Path,
+    contents: Manifest,
+    partial: Path,
+    folder: Path,
+    *,
+    unix_s: int,
+    replace: bool,
 ) -> Path | None:
     """Build a folder in `partial` and move it into place; return the path of the previous one."""
     if not folder.exists() or not any(folder.iterdir()):
@@ -367,7 +373,7 @@ def _has_data(folder: Path) -> StoreError:
     )
 
 
-def _build(source: Path, partial: Path, contents: Contents, *, unix_s: int, epoch: int) -> None:
+def _build(source: Path, partial: Path, contents: Manifest, *, unix_s: int, epoch: int) -> None:
     """Build a folder from a backup, fully checked, whose next epoch is above `epoch`."""
     backup, files, modes = contents
     names = files if files is not None else files_of(source)
@@ -378,7 +384,7 @@ def _build(source: Path, partial: Path, contents: Contents, *, unix_s: int, epoc
         check_files(partial, files)
     with read_store(partial) as stored:
         _check_bodies(stored)
-        found = _told(stored, cell=backup.cell, shard=backup.shard, unix_s=backup.unix_s)
+        found = _description(stored, cell=backup.cell, shard=backup.shard, unix_s=backup.unix_s)
     if found != dataclasses.replace(backup, digests=True):
         raise StoreError(
             f"{source} has changed since it was made: it has {found.states} states with"

@@ -206,9 +206,9 @@ def check_modes(modes: dict[str, str], files: Iterable[str]) -> dict[str, str]:
 # ---------------------------------------------------------------- backup.json
 
 
-def sealed(told: dict[str, Any], files: dict[str, Digest]) -> bytes:
+def sealed(facts: dict[str, Any], files: dict[str, Digest]) -> bytes:
     """Return the text of `BACKUP_FILE`: description, digests of the files, its own digest."""
-    text = json.dumps({**told, FILES: files}).removesuffix("}").encode()
+    text = json.dumps({**facts, FILES: files}).removesuffix("}").encode()
     return text + f', "sha256": "{hashlib.sha256(text).hexdigest()}"}}'.encode()
 
 
@@ -228,11 +228,11 @@ def read_sealed(path: Path) -> tuple[dict[str, Any], dict[str, Digest] | None]:
                 f" but records {seal[2].decode()}; {_COPY_AGAIN}",
                 path=str(file),
             )
-        told = json.loads(text)
+        facts = json.loads(text)
         if seal is None:
-            return dict(told), None
-        del told["sha256"]
-        return told, {name: _listed(name, *digest) for name, digest in told.pop(FILES).items()}
+            return dict(facts), None
+        del facts["sha256"]
+        return facts, {name: _listed(name, *digest) for name, digest in facts.pop(FILES).items()}
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as failure:
         raise StoreError(
             f"{path} is no backup of a shard: its {BACKUP_FILE} cannot be read ({failure})",

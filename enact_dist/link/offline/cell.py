@@ -7,7 +7,7 @@ While a folder is marked (`link.folder.marks`), no shard starts from it.
 from __future__ import annotations
 
 from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.core.protocol.records import Persist
 from enact_dist.errors import StoreError
@@ -20,6 +20,17 @@ if TYPE_CHECKING:
 
     from enact_dist.core.protocol.records import Record, Recovered
     from enact_dist.link.store.store import Store
+
+
+class _Silent:
+    """Ignores all reports."""
+
+    def __getattr__(self, name: str) -> Callable[..., None]:
+        return lambda *_facts: None
+
+
+SILENT: Final[Any] = _Silent()
+"""Takes the progress of a run whose caller wants none."""
 
 
 @contextmanager

@@ -17,17 +17,17 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 from enact_dist.core.offline.forgetting import planned, unused_aspects, unused_worlds, world_drops
 from enact_dist.errors import MisuseError
 from enact_dist.link.folder.marks import mark, under_way, unmark
-from enact_dist.link.offline.cell import opened, refuse_obstacles, write
+from enact_dist.link.offline.cell import SILENT, opened, refuse_obstacles, write
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Mapping
     from pathlib import Path
 
-    from enact_dist.core.offline.forgetting import Going, Plan
+    from enact_dist.core.offline.forgetting import Going, PurgePlan
     from enact_dist.core.protocol.records import Recovered
 
 
-class Progress(Protocol):
+class PurgeProgress(Protocol):
     """Reports what is purged, and the progress."""
 
     def found(self, forgotten: Forgotten) -> None:
@@ -35,16 +35,6 @@ class Progress(Protocol):
 
     def act(self, name: str) -> None:
         """Take the next step; it is durable before the one after."""
-
-
-class _Nobody:
-    """Ignores all reports."""
-
-    def found(self, forgotten: Forgotten) -> None:
-        """Do nothing."""
-
-    def act(self, name: str) -> None:
-        """Do nothing."""
 
 
 class Forgotten(NamedTuple):
@@ -73,7 +63,7 @@ def look(
     aspects: Iterable[str],
     *,
     unused: Collection[str] | None = None,
-    progress: Progress | None = None,
+    progress: PurgeProgress | None = None,
 ) -> Forgotten:
     """Return what `forget` would purge; change nothing.
 
@@ -89,7 +79,7 @@ def look(
     """
     with opened(folders) as (_, stored):
         found, _ = _plan(folders, stored, aspects, now_ns=0, unused=unused)
-    (progress or _Nobody()).found(found)
+    (progress or SILENT).found(found)
     _refuse_unknown(found)
     return found
 
@@ -100,7 +90,7 @@ def forget(
     *,
     now_ns: int,
     unused: Collection[str] | None = None,
-    progress: Progress | None = None,
+    progress: PurgeProgress | None = None,
 ) -> Forgotten:
     """Purge aspects, with all data that these shards have of them.
 
@@ -117,7 +107,7 @@ def forget(
             missing, or a commit that names an aspect is undecided; the message says what to do.
         MisuseError: None of these shards ever knew one of the aspects.
     """
-    progress = progress or _Nobody()
+    progress = progress or SILENT
     with opened(folders, progress.act, unix_s=now_ns // 1_000_000_000) as (stores, stored):
         found, plan = _plan(folders, stored, aspects, now_ns=now_ns, unused=unused)
         progress.found(found)
@@ -145,7 +135,7 @@ def _plan(
     *,
     now_ns: int,
     unused: Collection[str] | None,
-) -> tuple[Forgotten, Plan]:
+) -> tuple[Forgotten, PurgePlan]:
     """Return the plan; aspects of an interrupted run are purged as well.
 
     Raises:

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 from enact_dist.core.offline.moving import Move, Shards
 from enact_dist.link.folder.marks import mark, under_way, unmark
-from enact_dist.link.offline.cell import opened, refuse_obstacles, write
+from enact_dist.link.offline.cell import SILENT, opened, refuse_obstacles, write
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -46,19 +46,6 @@ class Progress(Protocol):
 
     def waits(self, wait_s: float) -> None:
         """Take the remaining wait for leases from before the stop."""
-
-
-class _Nobody:
-    """Ignores all reports."""
-
-    def act(self, name: str) -> None:
-        """Do nothing."""
-
-    def moved(self, entities: int, size: int) -> None:
-        """Do nothing."""
-
-    def waits(self, wait_s: float) -> None:
-        """Do nothing."""
 
 
 class Rebalance(NamedTuple):
@@ -107,7 +94,7 @@ def rebalance(
         StoreError: A folder is in use, damaged or cannot be written, folders of an earlier run are
             missing, or something would be lost; the message says what to do.
     """
-    progress = progress or _Nobody()
+    progress = progress or SILENT
     with opened(folders, progress.act, unix_s=unix_s) as (stores, stored):
         locked_s = time.monotonic()
         resumed = bool(under_way(folders))

@@ -32,7 +32,7 @@ from enact_dist.link.store.rows import (
     INLINE_BYTES_MAX,
     Key,
     Kind,
-    Order,
+    RowOrder,
     cause_body,
     cause_key,
     key_of,
@@ -45,7 +45,7 @@ from enact_dist.link.store.states import State, States
 from enact_dist.terms import Durability
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Collection
 
     from enact_dist.core.protocol.datum import LockId, Slot
     from enact_dist.core.protocol.messages import AspectEntry, Cause
@@ -116,11 +116,15 @@ class Batch:
                     for slot, version in record.versions:
                         self._forget(slot, version)
                 case WorldDropped():
-                    self._drop(record)
+                    self.changes[key_of(Kind.WORLD, record.name)] = None
+                    self._remove_all("context", {record.name})
+                    self._put(record)
                 case AspectForgotten():
-                    self._forget_aspect(record)
+                    self.changes[key_of(Kind.ASPECT, record.name)] = None
+                    self._remove_all("aspect", {record.name})
+                    self._put(record)
                 case EntitiesMoved():
-                    self._move_out(frozenset(record.entities))
+                    self._remove_all("entity", frozenset(record.entities))
                 case PreparedRecord():
                     self._prepare(record, durable=durable)
                 case PreparedEnded():
@@ -160,21 +164,8 @@ class Batch:
             if not versions:
                 del self._states.history[slot]
 
-    def _drop(self, record: WorldDropped) -> None:
-        self.changes[key_of(Kind.WORLD, record.name)] = None
-        self._remove_slots(lambda slot: slot.context == record.name)
-        self._put(record)
-
-    def _forget_aspect(self, record: AspectForgotten) -> None:
-        self.changes[key_of(Kind.ASPECT, record.name)] = None
-        self._remove_slots(lambda slot: slot.aspect == record.name)
-        self._put(record)
-
-    def _move_out(self, entities: frozenset[str]) -> None:
-        self._remove_slots(lambda slot: slot.entity in entities)
-
-    def _remove_slots(self, goes: Callable[[Slot], bool]) -> None:
-        for key in self._states.take_out(goes):
+    def _remove_all(self, part: str, names: Collection[str]) -> None:
+        for key in self._states.take_out(part, names):
             self._remove(key)
 
     def _remove(self, key: Key) -> None:
@@ -240,9 +231,9 @@ class Batch:
         gone = isinstance(record, KeptRecord) and not record.versions
         self.changes[key] = None if gone else body
 
-    def _next(self) -> Order:
+    def _next(self) -> RowOrder:
         self._count += 1
-        return Order(self._number, self._count)
+        return RowOrder(self._number, self._count)
 
     # ---------------------------------------------------------------- files and rows
 
@@ -256,7 +247,7 @@ class Batch:
             OSError: As the system reports it.
         """
         made = Counter(id(staged.record.cause) for staged in self._staged.values())
-        causes: dict[int, Order] = {}
+        causes: dict[int, RowOrder] = {}
         names_to_sync = False
         for key, staged in self._staged.items():
             record, durable = staged.record, staged.durable
@@ -292,7 +283,7 @@ class Batch:
             return None
         return self._states.as_forced(blob)
 
-    def _shared_cause(self, key: Key, cause: Cause, causes: dict[int, Order]) -> Order:
+    def _shared_cause(self, key: Key, cause: Cause, causes: dict[int, RowOrder]) -> RowOrder:
         """Make a row name the row of its cause, which is written with the first such row."""
         order = causes.get(id(cause))
         if order is None:

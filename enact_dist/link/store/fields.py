@@ -65,6 +65,7 @@ class RowLayout(Generic[T]):
 
     Attributes:
         kinds: The types that msgpack shows for each field.
+        fields: Returns the fields of a value, to be packed.
     """
 
     def __init__(self, of: type[T], *, without: str = "", open_end: bool = False) -> None:
@@ -83,9 +84,15 @@ class RowLayout(Generic[T]):
         self.kinds = [kinds for part in parts for kinds in part.kinds]
         self._least = len(self.kinds) - open_end
         self._drops_end = open_end and get_origin([*hints.values()][-1]) is tuple
-        writers = [(at, part.write) for at, part in enumerate(parts) if part.write is not None]
+        writers = [
+            (at, part.write)
+            for at, part in enumerate(parts)
+            if part.write is not None or len(part.kinds) > 1
+        ]
         self._writers = writers[::-1]
-        self._leads = writers == [(0, tuple)]  # most values: entries of causes, reads and writes
+        self.fields: Callable[[T], list[Any]] = self._fields_of
+        if self._get is tuple and writers == [(0, None)]:
+            self.fields = _led  # most values: entries of causes, reads and writes
         self._readers = [
             (at, at + len(part.kinds), part.read)
             for at, part in enumerate(parts)
@@ -102,21 +109,16 @@ class RowLayout(Generic[T]):
         """Whether the values are packed as they are."""
         return not self._writers and not self._drops_end
 
-    def fields(self, value: T) -> list[Any]:
-        """Return the fields of a value, to be packed."""
-        if self._leads:
-            first, *rest = self._get(value)
-            return [*first, *rest]
+    def _fields_of(self, value: T) -> list[Any]:
         fields = [*self._get(value)]
         if self._drops_end and not fields[-1]:
             fields.pop()
         for at, write in self._writers:
-            fields[at : at + 1] = write(fields[at])
+            if write is None:
+                fields[at : at + 1] = fields[at]
+            else:
+                fields[at] = write(fields[at])
         return fields
-
-    def field(self, value: T) -> tuple[list[Any]]:
-        """Return the one field of a value that is part of another."""
-        return (self.fields(value),)
 
     def read(self, fields: list[Any]) -> T:
         """Return the value with these fields, which are used up.
@@ -147,17 +149,22 @@ class RowLayout(Generic[T]):
         raise DamagedRowError(f"{reprlib.repr(fields)} {problem}")
 
 
+def _led(value: Any) -> list[Any]:
+    """Return the fields of a tuple whose first part has several."""
+    return [*value[0], *value[1:]]
+
+
 class _Part(NamedTuple):
     """How one attribute is stored.
 
     Attributes:
         kinds: The types that msgpack shows for each of its fields.
-        write: Returns the fields of its value; None: the value is the field.
-        read: Returns the value of its fields; None: likewise.
+        write: Returns the field of its value; None: the value is the field, or has the fields.
+        read: Returns the value of its fields; None: the field is the value.
     """
 
     kinds: list[tuple[type, ...]]
-    write: Callable[[Any], Sequence[Any]] | None = None
+    write: Callable[[Any], Any] | None = None
     read: Callable[..., Any] | None = None
 
 
@@ -165,13 +172,13 @@ def _part(hint: Any, *, spread: bool = True) -> _Part:
     if hint in _AS_THEY_ARE:
         return _Part([(hint,)])
     if spread and hint in _SPREAD:
-        return _Part(RowLayout(hint).kinds, tuple, hint)
+        return _Part(RowLayout(hint).kinds, None, hint)
     if isinstance(hint, UnionType):
         return _choice(get_args(hint))
     if get_origin(hint) is tuple and get_args(hint)[-1] is ...:
         return _series(_part(get_args(hint)[0], spread=False))
     layout = RowLayout(hint)
-    return _Part([(list,)], None if layout.is_plain else layout.field, layout.read)
+    return _Part([(list,)], None if layout.is_plain else layout.fields, layout.read)
 
 
 def _series(one: _Part) -> _Part:
@@ -185,7 +192,7 @@ def _series(one: _Part) -> _Part:
 
     if write is None:
         return _Part([(list,)], None, read_all)
-    return _Part([(list,)], lambda values: ([write(value)[0] for value in values],), read_all)
+    return _Part([(list,)], lambda values: [write(value) for value in values], read_all)
 
 
 def _choice(hints: Sequence[Any]) -> _Part:
@@ -194,9 +201,9 @@ def _choice(hints: Sequence[Any]) -> _Part:
     by_length = {layout.length: layout for layout in layouts.values()}
     longest = by_length[max(by_length)]
 
-    def write(value: Any) -> Sequence[Any]:
+    def write(value: Any) -> Any:
         layout = layouts.get(type(value))
-        return (value,) if layout is None else layout.field(value)
+        return value if layout is None else layout.fields(value)
 
     def read(found: Any) -> Any:
         return by_length.get(len(found), longest).read(found) if type(found) is list else found

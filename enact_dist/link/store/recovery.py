@@ -27,7 +27,7 @@ from enact_dist.link.store.fields import DamagedRowError
 from enact_dist.link.store.rows import (
     Key,
     Kind,
-    Order,
+    RowOrder,
     StoredSlot,
     cause_key,
     prepared_writes,
@@ -101,9 +101,9 @@ class Contents:
     ids: dict[Key, int] = field(default_factory=dict)
     states: States = field(default_factory=States)
     records: dict[Key, SlotRecord] = field(default_factory=dict)
-    orders: dict[Slot, list[tuple[Order, Key]]] = field(default_factory=dict)
+    orders: dict[Slot, list[tuple[RowOrder, Key]]] = field(default_factory=dict)
     causes: dict[Key, Cause] = field(default_factory=dict)
-    acts: dict[Order, AuditRecord] = field(default_factory=dict)
+    acts: dict[RowOrder, AuditRecord] = field(default_factory=dict)
     ended: dict[str, int] = field(default_factory=dict)
     prepared: dict[LockId, tuple[Key, bytes]] = field(default_factory=dict)
     lost: dict[Key, SlotRecord] = field(default_factory=dict)
@@ -171,7 +171,7 @@ def _take_state(key: Key, found: StoredSlot, contents: Contents) -> None:
         contents.states.name_cause(key, cause_key(found.shared_cause))
 
 
-def _sort_states(slot: Slot, rows: list[tuple[Order, Key]], contents: Contents) -> None:
+def _sort_states(slot: Slot, rows: list[tuple[RowOrder, Key]], contents: Contents) -> None:
     """Find out which of a slot's rows, oldest first, is its newest state; the rest is history."""
     _, key = rows.pop()
     newest = contents.records[key]

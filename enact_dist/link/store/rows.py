@@ -77,7 +77,7 @@ class Key(NamedTuple):
     name: bytes
 
 
-class Order(NamedTuple):
+class RowOrder(NamedTuple):
     """When a row was written: the batch, and the position in it."""
 
     batch: int
@@ -180,7 +180,7 @@ class _StoredState(NamedTuple):
     stamp_ns: int
     null_reason: str
     datum: _StoredDatum | None
-    cause: Order | Cause | None
+    cause: RowOrder | Cause | None
 
 
 class _SlotKey(NamedTuple):
@@ -203,11 +203,11 @@ class StoredSlot(NamedTuple):
 
     record: SlotRecord
     blob: Blob | None = None
-    shared_cause: Order | None = None
+    shared_cause: RowOrder | None = None
 
 
 _EPOCH: Final = RowLayout(tuple[int])
-_ORDER: Final = RowLayout(Order)
+_ORDER: Final = RowLayout(RowOrder)
 _LOCK: Final = RowLayout(LockId)
 _CAUSE: Final = RowLayout(Cause)
 _STATE: Final = RowLayout(_StoredState)
@@ -215,7 +215,7 @@ _SLOT_KEY: Final = RowLayout(_SlotKey)
 _WRITE_KEY: Final = RowLayout(_WriteKey)
 
 
-def slot_body(record: SlotRecord, blob: Blob | None, shared_cause: Order | None = None) -> bytes:
+def slot_body(record: SlotRecord, blob: Blob | None, shared_cause: RowOrder | None = None) -> bytes:
     """Return the row of a slot's state.
 
     Args:
@@ -247,23 +247,23 @@ def read_slot(slot: Slot, body: bytes) -> StoredSlot:
             datum, blob = Datum(encoding, b"", place.size, captured_ns), place
         else:
             datum = Datum(encoding, place, len(place), captured_ns)
-    if isinstance(cause, Order):
+    if isinstance(cause, RowOrder):
         cause, shared = None, cause
     return StoredSlot(SlotRecord(slot, version, stamp_ns, datum, reason, cause=cause), blob, shared)
 
 
-def slot_key(slot: Slot, order: Order) -> Key:
+def slot_key(slot: Slot, order: RowOrder) -> Key:
     """Return the key of the state of a slot that was set then."""
     return key_of(Kind.SLOT, *slot, *order)
 
 
-def read_slot_key(key: Key) -> tuple[Slot, Order]:
+def read_slot_key(key: Key) -> tuple[Slot, RowOrder]:
     """Return which slot's state a row holds, and when it was set."""
     slot, batch, number = _SLOT_KEY.read(unpack(key.name))
-    return slot, Order(batch, number)
+    return slot, RowOrder(batch, number)
 
 
-def cause_key(order: Order) -> Key:
+def cause_key(order: RowOrder) -> Key:
     """Return the key of a cause that several states share."""
     return key_of(Kind.CAUSE, *order)
 
@@ -278,7 +278,7 @@ def read_cause(body: bytes) -> Cause:
     return _CAUSE.read(unpack(body))
 
 
-def read_order(key: Key) -> Order:
+def read_order(key: Key) -> RowOrder:
     """Return when an operator's action or a shared cause was stored."""
     return _ORDER.read(unpack(key.name))
 

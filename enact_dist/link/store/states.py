@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from enact_dist.link.store.rows import Key, Kind, key_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from collections.abc import Collection, Iterable, Iterator, Mapping
 
     from enact_dist.core.protocol.datum import LockId, Slot
     from enact_dist.core.protocol.records import SlotRecord
@@ -105,11 +105,11 @@ class States:
             return old
         return newest.key if old is None else None
 
-    def take_out(self, goes: Callable[[Slot], bool]) -> Iterator[Key]:
-        """Yield the rows of all states of slots being deleted, and drop them."""
-        for slot in [slot for slot in self.newest if goes(slot)]:
+    def take_out(self, part: str, names: Collection[str]) -> Iterator[Key]:
+        """Yield the rows of all states of slots whose `part` is one of `names`, and drop them."""
+        for slot in [slot for slot in self.newest if getattr(slot, part) in names]:
             yield self.newest.pop(slot).key
-        for slot in [slot for slot in self.history if goes(slot)]:
+        for slot in [slot for slot in self.history if getattr(slot, part) in names]:
             yield from self.history.pop(slot).values()
 
     def name_blob(self, key: Key, blob: Blob) -> None:

@@ -185,11 +185,11 @@ class Store:
                 " restart the shard",
                 path=name,
             )
-        with self._medium.errors():
-            try:
-                act()
-            except BaseException as failure:
-                self._failure = failure
+        try:
+            act()
+        except BaseException as failure:
+            self._failure = failure
+            with self._medium.errors():
                 raise
 
     def _write(self, batch: Sequence[Persist]) -> None:

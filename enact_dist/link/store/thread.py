@@ -8,29 +8,20 @@ from __future__ import annotations
 
 import threading
 import time
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.state.clock import Latencies
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
 
     from enact_dist.core.protocol.records import Persist
+    from enact_dist.link.store.store import Store
 
 REPORTED_MAX: Final = 8
 """Tickets reported at once: about 1 ms, during which the host holds its mutex."""
 HAND_ON_S: Final = 0.00005
 """Pause in between: a mutex stays with a thread that reacquires it at once."""
-
-
-class BatchStore(Protocol):
-    """The thread's destination: a `Store`."""
-
-    def write(self, batch: Sequence[Persist]) -> None:
-        """Apply a batch atomically; raise if that fails."""
-
-    def rest(self) -> None:
-        """Do what can wait until after the acknowledgement."""
 
 
 class StoreThread:
@@ -50,7 +41,7 @@ class StoreThread:
 
     def __init__(
         self,
-        store: BatchStore,
+        store: Store,
         done: Callable[[list[int]], None],
         failed: Callable[[Exception], None],
     ) -> None:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.core.protocol.datum import Datum
 from enact_dist.core.protocol.messages import Commit, EpochChanged, Prepare, Stage, Staged
 from enact_dist.core.protocol.records import Persist, PreparedRecord, SlotRecord
-from enact_dist.link.memory.maps import Plain
+from enact_dist.link.memory.maps import PlainMemory
 from enact_dist.link.memory.payload_desk import PayloadDesk
 from enact_dist.verify.simulation.hosts.world import Host, S
 
@@ -53,7 +53,7 @@ class ShardPayloads:
     def __init__(self, host: Host, shard: Shard) -> None:
         self._world, self._shard, self._host = host.world, shard, host
         self.desk = PayloadDesk(None, BYTES_MAX, clock=HostClock(host))
-        self._adopted: dict[str, weakref.ref[Plain]] = {}
+        self._adopted: dict[str, weakref.ref[PlainMemory]] = {}
         self._drafts: dict[str, tuple[str, int, int]] = {}
         """Of each draft its session, its first and its newest slice, by the shard's clock."""
 
@@ -138,9 +138,9 @@ def _as_in_a_frame(write: WriteItem) -> WriteItem:
     return write._replace(datum=replace(datum, body=b""))
 
 
-def _memory_of(datum: Datum | None) -> Plain | None:
+def _memory_of(datum: Datum | None) -> PlainMemory | None:
     body = None if datum is None else datum.body
-    if isinstance(body, memoryview) and isinstance(body.obj, Plain):
+    if isinstance(body, memoryview) and isinstance(body.obj, PlainMemory):
         return body.obj
     return None
 
