@@ -166,8 +166,13 @@ def test_carrier_holds_its_token_while_it_is_open(daemon, carry, make_peer, endp
 
 
 @both
-def test_carrier_reaches_further_shards_when_it_learns_of_them(daemon, carry, endpoint, free):
-    """A shard known by its advertised endpoint only is reached, and sees the token."""
+def test_carrier_reaches_further_shards_when_it_learns_of_them(
+    daemon, carry, endpoint, free, until
+):
+    """A shard known by its advertised endpoint only is reached, and sees the token.
+
+    Right after the connection its queryable may not be known yet: None, which means "ask again".
+    """
     second = free()
     daemon(endpoint)
     daemon(second, "s1")
@@ -176,7 +181,10 @@ def test_carrier_reaches_further_shards_when_it_learns_of_them(daemon, carry, en
 
     carrier.add_endpoints([ShardEntry("s0", (endpoint,)), ShardEntry("s1", (second,))])
 
-    answers = carrier.request_all([("s0", ListLocks()), ("s1", ListLocks())], timeout_s=30)
+    asked = [("s0", ListLocks()), ("s1", ListLocks())]
+    answers = until(
+        lambda: None not in (found := carrier.request_all(asked, timeout_s=30)) and found
+    )
     assert [type(answer) for answer in answers] == [Locks, Locks]
     assert carrier.endpoint_of("s1") == second
 
