@@ -46,7 +46,7 @@ class ShardProcess:
 
 
 @dataclass(slots=True)
-class Client:
+class StartedClient:
     """A client process; `incarnation` counts its starts."""
 
     name: str
@@ -86,7 +86,7 @@ class TestedCell:
         self._all: list[LineProcess] = []
         self.file = folder / "cell.toml"
         self.shards: dict[str, ShardProcess] = {}
-        self.clients: dict[str, Client] = {}
+        self.clients: dict[str, StartedClient] = {}
         self.watcher: LineProcess
         worlds = ", ".join(f'"{world}"' for world in WORLDS)
         lines = [
@@ -172,9 +172,9 @@ class TestedCell:
             str(2 + index % 2),
         )
         process = self._run(CLIENT, words, name, host)
-        self.clients[name] = Client(name, host, process, incarnation)
+        self.clients[name] = StartedClient(name, host, process, incarnation)
 
-    def journal_of(self, client: Client) -> Path:
+    def journal_of(self, client: StartedClient) -> Path:
         """Return the journal of a client process; it exists once the process has started."""
         return self._journal(f"{client.name}.{client.incarnation}")
 

@@ -33,7 +33,7 @@ from enact_dist.verify.chaos.network.switch import Cable
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from enact_dist.verify.chaos.cell import Client, TestedCell
+    from enact_dist.verify.chaos.cell import StartedClient, TestedCell
     from enact_dist.verify.chaos.journal import Journal
     from enact_dist.verify.chaos.network.hosts import Hosts
 
@@ -64,7 +64,7 @@ POLL_S: Final = 0.02
 AIM_S: Final = 0.3
 
 
-class Injector:
+class FaultInjector:
     """Draws faults and carries them out.
 
     Args:
@@ -230,7 +230,7 @@ class Injector:
         self._cell.start_client(name, client.host, incarnation=client.incarnation + 1)
         return True
 
-    def _aim(self, client: Client) -> None:
+    def _aim(self, client: StartedClient) -> None:
         """Wait until the client is where it hurts: within a lock, or about to send a commit.
 
         Such moments are short and seldom hit by chance; without one within `AIM_S` any will do.
