@@ -172,7 +172,7 @@ class FaultInjector:
         process, from_ns = self._cell.shards[name].process, time.monotonic_ns()
         self._cell.shards[name].ready.clear()
         process.kill()
-        self._cell.forget(process)
+        self._cell.end(process)
         pause_s = self._draw.choice((0.0, 0.0, 0.2, 1.0, 2.0)) * self._ttl_s
         self._after(pause_s, lambda: self._start_shard(name, KILL_SHARD, from_ns))
         return True
@@ -211,7 +211,7 @@ class FaultInjector:
                     raise LinkError(f"shard {name} does not end {END_S:g} s after SIGTERM")
                 self._after(0.0, again)
                 return
-            self._cell.forget(shard.process)
+            self._cell.end(shard.process)
             self._start_shard(name, kind, from_ns, offset_s=offset_s)
 
         self._after(0.0, again)
@@ -226,7 +226,7 @@ class FaultInjector:
         from_ns = time.monotonic_ns()
         client.process.kill()
         self._note(KILL_CLIENT, [f"{name}.{client.incarnation}"], from_ns)
-        self._cell.forget(client.process)
+        self._cell.end(client.process)
         self._cell.start_client(name, client.host, incarnation=client.incarnation + 1)
         return True
 
