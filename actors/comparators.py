@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from actors.geometry.surface_distance import Mesh, clouds_apart, surfaces_apart
-from enact_dist.comparing import EQUAL, Difference
+from enact_dist import Difference
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -97,7 +97,7 @@ def _check(tolerance_m: Any, share: Any) -> None:
 
 def _difference(apart: Apart, tolerance_m: float, share: float) -> Difference:
     if not apart.largest_m:
-        return EQUAL
+        return Difference(0.0)
     if math.isinf(apart.largest_m):
         where, what = "", "one of them is empty"
     else:

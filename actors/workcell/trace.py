@@ -16,7 +16,7 @@ import numpy as np
 from actors.workcell import vocabulary as words
 from enact_dist import Aspect
 from enact_dist.errors import ConfigError
-from enact_dist.recording.reading import Recording
+from enact_dist.recording import Recording
 from enact_dist.wire.payload import decode_datum
 
 if TYPE_CHECKING:

@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 from actors.running_cell import toml_of
 from actors.workcell import vocabulary as words
 from actors.workcell.demo_cell import TEMPLATE, configured
-from enact_dist import Entity
-from enact_dist.access.together import Together
+from enact_dist import Entity, Together
 from enact_dist.actor.running.load import configured_actor
 from enact_dist.config.read import load_config
 

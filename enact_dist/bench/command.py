@@ -26,7 +26,7 @@ from enact_dist.bench.cases.workcell import run_workcell
 from enact_dist.bench.floors import Floors
 from enact_dist.bench.place import EMBEDDED, Place
 from enact_dist.bench.rows import Row, shown_spread, shown_us
-from enact_dist.bench.run import Answer, Asked, Run
+from enact_dist.bench.run import Answer, PackingOptions, Run
 from enact_dist.bench.tables import table
 from enact_dist.bench.visit import PEAK_BYTES, without_room
 from enact_dist.cli.text.benches import BENCHES as TOLD
@@ -151,7 +151,7 @@ def run(arguments: argparse.Namespace) -> int:
         floors = stack.enter_context(Floors(folder, memory))
         told = stack.enter_context(_progress())
         seconds_s = arguments.seconds_s or SECONDS_S
-        packing = Asked(
+        packing = PackingOptions(
             arguments.packages,
             arguments.seed,
             arguments.processes,

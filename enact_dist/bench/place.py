@@ -14,7 +14,7 @@ from enact_dist.bench.visit import Visit, anywhere
 from enact_dist.config.types import CARRIERS
 from enact_dist.link.memory.shared_folder import MEMORY, SHARED_FOLDER_VARIABLE
 from enact_dist.operate.supervise import SUPERVISOR_VARIABLE
-from enact_dist.verify.daemons import KeptPorts, LineProcess
+from enact_dist.verify.daemons import COMMAND, KeptPorts, LineProcess, write_cell
 from enact_dist.world.connecting import connect, local
 
 if TYPE_CHECKING:
@@ -27,7 +27,6 @@ WORLD: Final = "bench"
 """The world context that all benches write into; made if it does not exist."""
 EMBEDDED: Final = "embedded"
 CARRIER_VARIABLE: Final = "ENACT_CARRIER"
-COMMAND: Final = "enact_dist.cli.main"
 WORKER: Final = "enact_dist.bench.cases.worker"
 PIPELINE_WORKER: Final = "enact_dist.bench.cases.pipeline_worker"
 WORKERS_S: Final = 120.0
@@ -132,16 +131,13 @@ class Place:
     def _start_daemons(self) -> str:
         file, ports = self.folder / "cell.toml", KeptPorts()
         self._stack.callback(ports.close)
-        lines = [
-            'name = "bench"',
-            f'worlds = ["{WORLD}"]',
-            f"data_folder = {json.dumps(str(self.folder / 'data'))}",
-        ]
-        for name in self.shard_names:
-            lines += [f"[shards.{name}]", f'listen = "tcp/127.0.0.1:{ports.free()}"']
-        for name in self.shard_names:
-            lines += ["[[pins]]", f'entities = "{name}/**"', f'shard = "{name}"']
-        file.write_text("\n".join(lines) + "\n")
+        write_cell(
+            file,
+            "bench",
+            worlds=[WORLD],
+            listen={name: f"tcp/127.0.0.1:{ports.free()}" for name in self.shard_names},
+            pins={f"{name}/**": name for name in self.shard_names},
+        )
         # They end with us, however we end: nothing else would ever stop them.
         with environment(**{CARRIER_VARIABLE: "auto", SUPERVISOR_VARIABLE: str(os.getpid())}):
             self._daemons = [

@@ -14,7 +14,7 @@ FLOOR: Final = "floor"
 
 
 @dataclass(frozen=True, slots=True)
-class Sample:
+class Timings:
     """Many times of the same act.
 
     Attributes:
@@ -30,10 +30,10 @@ class Sample:
     rounds_us: tuple[float, ...] = ()
 
 
-Figures: TypeAlias = Mapping[Key, Sample]
+Figures: TypeAlias = Mapping[Key, Timings]
 
 
-def sample_of(times_us: Sequence[float]) -> Sample:
+def sample_of(times_us: Sequence[float]) -> Timings:
     """Return what many times have in common.
 
     Raises:
@@ -43,7 +43,7 @@ def sample_of(times_us: Sequence[float]) -> Sample:
         raise ValueError("nothing was measured")
     ordered = sorted(times_us)
     at = min(len(ordered) - 1, int(len(ordered) * 0.99))
-    return Sample(statistics.median(ordered), ordered[at], len(ordered))
+    return Timings(statistics.median(ordered), ordered[at], len(ordered))
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ class Goal:
     p99_us: float | None = None
     needs: tuple[Key, ...] = ()
 
-    def met(self, sample: Sample, figures: Figures) -> bool | None:
+    def met(self, sample: Timings, figures: Figures) -> bool | None:
         """Say whether `sample` keeps to it; None where this run does not show it."""
         limit_us = self.limit_us(figures)
         if limit_us is None:
@@ -210,12 +210,12 @@ def row_of(case: Case, figures: Figures) -> Row:
     )
 
 
-def _spread_us(sample: Sample) -> tuple[float, float] | None:
+def _spread_us(sample: Timings) -> tuple[float, float] | None:
     rounds_us = sample.rounds_us
     return (round(min(rounds_us), 2), round(max(rounds_us), 2)) if len(rounds_us) > 1 else None
 
 
-def _beside(case: Case, sample: Sample, figures: Figures) -> str:
+def _beside(case: Case, sample: Timings, figures: Figures) -> str:
     if case.beside is None or case.beside[0] not in figures:
         return ""
     key, name = case.beside

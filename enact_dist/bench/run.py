@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from enact_dist.bench.floors import Floors
 from enact_dist.bench.place import EMBEDDED
-from enact_dist.bench.rows import FLOOR, Case, Key, Row, Sample, row_of, sample_of
+from enact_dist.bench.rows import FLOOR, Case, Key, Row, Timings, row_of, sample_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -41,7 +41,7 @@ HERE: Final = frozenset((FLOOR, "core"))
 """What is measured of this machine, wherever the cell is."""
 
 
-class Asked(NamedTuple):
+class PackingOptions(NamedTuple):
     """What is to be packed.
 
     Attributes:
@@ -118,13 +118,13 @@ class Run:
         seconds_s: float,
         told: Callable[[str], None],
         seeds: int = 1,
-        packing: Asked | None = None,
+        packing: PackingOptions | None = None,
     ) -> None:
         self.place, self.floors = place, floors
         self.seconds_s = seconds_s
         self.told, self.seeds = told, seeds
-        self.packing = packing or Asked()
-        self._figures: dict[Key, Sample] = {}
+        self.packing = packing or PackingOptions()
+        self._figures: dict[Key, Timings] = {}
         self._times_us: dict[Key, list[float]] = {}
         self._cases: dict[Key, Case] = {}
         self._others: list[Row] = []

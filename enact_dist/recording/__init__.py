@@ -43,12 +43,14 @@ from enact_dist.recording.libraries import require_libraries
 require_libraries()
 
 from enact_dist.recording.exporting import ExportSummary, export_world  # noqa: E402
+from enact_dist.recording.reading import Recording  # noqa: E402
 from enact_dist.recording.recorder import Recorder, RecordingSummary  # noqa: E402
 from enact_dist.recording.replaying import Replay, ReplaySummary  # noqa: E402
 
 __all__ = [
     "ExportSummary",
     "Recorder",
+    "Recording",
     "RecordingSummary",
     "Replay",
     "ReplaySummary",

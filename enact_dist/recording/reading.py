@@ -61,7 +61,7 @@ class AspectFacts(NamedTuple):
     durability: str
 
 
-class Commit(NamedTuple):
+class RecordedCommit(NamedTuple):
     """The data of one commit.
 
     Attributes:
@@ -113,7 +113,7 @@ class Recording:
                 f" reads {FORMAT}"
             )
 
-    def commits(self) -> Iterator[Commit]:
+    def commits(self) -> Iterator[RecordedCommit]:
         """Yield the commits in the order of the file, as far as it is whole.
 
         Raises:
@@ -127,12 +127,12 @@ class Recording:
                 recorded = self._checked(decode_recorded(message.data))
                 begins = versions and recorded.commit != versions[-1].commit
                 if begins:
-                    yield Commit(versions[0].commit, log_ns, tuple(versions))
+                    yield RecordedCommit(versions[0].commit, log_ns, tuple(versions))
                     versions = []
                 versions.append(recorded)
                 log_ns = message.log_time
             if versions:
-                yield Commit(versions[0].commit, log_ns, tuple(versions))
+                yield RecordedCommit(versions[0].commit, log_ns, tuple(versions))
 
     def _checked(self, recorded: Recorded) -> Recorded:
         """Return a version whose names no shard, log or terminal has to fear.

@@ -18,7 +18,7 @@ from enact_dist.core.protocol.messages import AspectEntry, Item
 from enact_dist.errors import ConfigError, DatumTypeError, MisuseError
 from enact_dist.patterns import pattern_matches
 from enact_dist.recording.other_writers import OtherWriters
-from enact_dist.recording.reading import Commit, Recording
+from enact_dist.recording.reading import RecordedCommit, Recording
 from enact_dist.terms import Access, Entities, checked_name
 from enact_dist.wire.limits import BODY_BYTES_MAX, ITEMS_MAX
 from enact_dist.wire.payload import Encoded
@@ -220,7 +220,7 @@ class Replay:
             self.summary.commits += commit.number > 0
             tell(self.summary)
 
-    def _chosen(self) -> Iterator[Commit]:
+    def _chosen(self) -> Iterator[RecordedCommit]:
         """Yield what is to be committed; first the state as of the begin, where one is named."""
         before: dict[Slot, Recorded] = {}
         for commit in self._wanted():
@@ -228,15 +228,15 @@ class Replay:
                 before.update((recorded.slot, recorded) for recorded in commit.versions)
                 continue
             if before:
-                yield Commit(0, self._from_ns, tuple(before.values()))
+                yield RecordedCommit(0, self._from_ns, tuple(before.values()))
                 before = {}
             if self._to_ns and commit.log_ns > self._to_ns:
                 continue  # a later one may stand before it in the file
             yield commit
         if before:
-            yield Commit(0, self._from_ns, tuple(before.values()))
+            yield RecordedCommit(0, self._from_ns, tuple(before.values()))
 
-    def _wanted(self) -> Iterator[Commit]:
+    def _wanted(self) -> Iterator[RecordedCommit]:
         """Yield the commits with those of their data that were chosen, if any."""
         for commit in self.recording.commits():
             versions = tuple(one for one in commit.versions if self._wants(one.slot))

@@ -1,12 +1,12 @@
 """Was everything that committed strictly serializable?  Judges a history, wherever it comes from.
 
 A history is what each lock read, wrote and had as answers (`LockStory`), and per slot the states
-that it went through, oldest first (`State`).  Slot versions give the exact dependencies: who wrote
-after whom (ww), who read whose write (wr), whose read was overwritten by whom (rw).  Real time
-gives the rest: what ended before another began comes before it.  An order exists exactly if the
-graph has no cycle; it is searched in linear time.
+that it went through, oldest first (`ChainState`).  Slot versions give the exact dependencies: who
+wrote after whom (ww), who read whose write (wr), whose read was overwritten by whom (rw).  Real
+time gives the rest: what ended before another began comes before it.  An order exists exactly if
+the graph has no cycle; it is searched in linear time.
 
-Nothing here knows the core: the simulator (`simulation.graph`) and the runner of real processes
+Nothing here knows the core: the simulator (`simulation.judges`) and the runner of real processes
 (`chaos.evidence`) tell their histories in the words of this module.
 """
 
@@ -37,7 +37,7 @@ NOTHING: Final = None
 """Name of what a slot holds before its first state."""
 
 
-class Told(enum.Enum):
+class LockOutcome(enum.Enum):
     """The outcome of a lock as its thread learned it."""
 
     COMMITTED = "committed"
@@ -46,7 +46,7 @@ class Told(enum.Enum):
     """Or nothing: its process died."""
 
 
-class State(NamedTuple):
+class ChainState(NamedTuple):
     """One state of a slot.
 
     Attributes:
@@ -62,14 +62,14 @@ class State(NamedTuple):
     captured_ns: int = 0
 
 
-class Reading(NamedTuple):
+class StateRead(NamedTuple):
     """One state that a lock was shown; the name may be `NOTHING`."""
 
     slot: Slot
     name: Name
 
 
-class Captured(NamedTuple):
+class CapturedRead(NamedTuple):
     """One state that a lock was shown by its capture stamp; `NOTHING` where none was retained."""
 
     slot: Slot
@@ -96,12 +96,12 @@ class LockStory:
     id: Writer
     begun_ns: int
     ended_ns: int | None
-    told: Told
-    reads: Sequence[Reading] = ()
-    views: Sequence[Reading] = ()
+    told: LockOutcome
+    reads: Sequence[StateRead] = ()
+    views: Sequence[StateRead] = ()
     writes: Sequence[Slot] = ()
     outlives_restarts: bool = False
-    captured: Sequence[Captured] = ()
+    captured: Sequence[CapturedRead] = ()
 
 
 class Anomaly(NamedTuple):
@@ -146,7 +146,7 @@ class Checker:
     def __init__(
         self,
         stories: Iterable[LockStory],
-        chains: Mapping[Any, Sequence[State]],
+        chains: Mapping[Any, Sequence[ChainState]],
         *,
         events: Mapping[Any, tuple[int, int]] | None = None,
         lost: Collection[Writer] = (),
@@ -168,7 +168,7 @@ class Checker:
         self.committed = [
             story
             for story in self._stories.values()
-            if story.told is Told.COMMITTED or story.id in visible
+            if story.told is LockOutcome.COMMITTED or story.id in visible
         ]
         self.views_checked = 0
         self.sets_checked = 0
@@ -212,14 +212,14 @@ class Checker:
             if story.id in self._lost:
                 continue
             where = self._written.get(story.id, {})
-            if story.told is Told.NOT and where:
+            if story.told is LockOutcome.NOT and where:
                 yield Anomaly("told not committed, but visible", (f"{story.id}: {list(where)}",))
                 continue
             missed = [slot for slot in story.writes if slot not in where]
             if where and missed:
                 facts = (f"{story.id}: in {list(where)}", f"not in {missed}")
                 yield Anomaly("half a commit", facts)
-            elif missed and story.told is Told.COMMITTED:
+            elif missed and story.told is LockOutcome.COMMITTED:
                 yield Anomaly("told committed, but lost", (f"{story.id}: not in {missed}",))
 
     def reading_anomalies(self) -> Iterator[Anomaly]:
@@ -273,7 +273,7 @@ class Checker:
     def _halves_of_sets(
         self,
         story: LockStory,
-        shown: Mapping[Slot, tuple[int | None, Captured]],
+        shown: Mapping[Slot, tuple[int | None, CapturedRead]],
         writers: Iterable[Writer],
     ) -> Iterator[Anomaly]:
         for lock in writers:
@@ -338,7 +338,7 @@ class Checker:
         points: list[tuple[int, int, int, Writer]] = []
         for story in self.committed:
             points.append((story.begun_ns, 0, len(points), story.id))
-            if story.told is Told.COMMITTED and story.ended_ns is not None:
+            if story.told is LockOutcome.COMMITTED and story.ended_ns is not None:
                 points.append((story.ended_ns, 1, len(points), story.id))
         for writer, (begun_ns, ended_ns) in self._events.items():
             points.append((begun_ns, 0, len(points), writer))

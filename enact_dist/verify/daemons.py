@@ -6,6 +6,7 @@ clock that its lines quote is the machine's monotonic one, which all processes s
 
 from __future__ import annotations
 
+import json
 import os
 import queue
 import signal
@@ -187,10 +188,62 @@ class LineProcess:
                 pipe.close()
 
 
-class CellProcesses:
-    """The shards of one cell on the loopback, and clients that join it.  A context manager.
+def write_cell(
+    file: Path,
+    name: str,
+    *,
+    worlds: Sequence[str],
+    listen: Mapping[str, str],
+    pins: Mapping[str, str],
+    **options: object,
+) -> None:
+    """Write the file of a throw-away cell, whose data lie beside it.
 
-    All of them do as the cell's file says, whatever this process's own settings are.
+    Args:
+        file: Where.
+        name: Of the cell.
+        worlds: Its world contexts.
+        listen: Shard → the endpoint at which it listens.
+        pins: Entity pattern → shard.
+        options: Further keys of the file.
+    """
+    keys = {"name": name, "worlds": list(worlds), "data_folder": str(file.parent / "data")}
+    lines = [f"{key} = {json.dumps(value)}" for key, value in (keys | options).items()]
+    for shard, endpoint in listen.items():
+        lines += [f"[shards.{shard}]", f"listen = {json.dumps(endpoint)}"]
+    for pattern, shard in pins.items():
+        lines += ["[[pins]]", f"entities = {json.dumps(pattern)}", f'shard = "{shard}"']
+    file.write_text("\n".join(lines) + "\n")
+
+
+class Processes:
+    """Processes of one cell.  All of them do as the cell's file says, whatever is set here."""
+
+    def __init__(self) -> None:
+        self._all: list[LineProcess] = []
+
+    def run(
+        self, module: str, words: Sequence[str], log: Path, *, before: Sequence[str] = ()
+    ) -> LineProcess:
+        """Start a process; see `LineProcess`."""
+        surroundings = without_overrides(os.environ)
+        process = LineProcess(module, words, log, before=before, environment=surroundings)
+        self._all.append(process)
+        return process
+
+    def end(self, process: LineProcess) -> None:
+        """End one process before the others."""
+        process.end()
+        self._all.remove(process)
+
+    def close(self) -> None:
+        """End every process, however it is; twice is harmless."""
+        while self._all:
+            self._all.pop().end()
+
+
+class CellProcesses(Processes):
+    """The shards of one cell on the loopback, and clients that join it.  A context manager.
 
     Args:
         folder: Existing and empty: for `cell.toml`, data and logs.
@@ -209,28 +262,27 @@ class CellProcesses:
         ttl_s: float,
         carrier: str = "auto",
     ) -> None:
+        super().__init__()
         self.folder = folder
         self.file = folder / "cell.toml"
         self.shards: dict[str, LineProcess] = {}
-        self._all: list[LineProcess] = []
+        self._clients = 0
         self._ports = KeptPorts()
-        lines = [
-            'name = "verify"',
-            'worlds = ["online"]',
-            f"session_ttl_s = {ttl_s}",
-            f'data_folder = "{folder}/data"',
-            f'carrier = "{carrier}"',
-        ]
-        for name in shards:
-            lines += [f"[shards.{name}]", f'listen = "tcp/127.0.0.1:{self._ports.free()}"']
-        for pattern, shard in pins.items():
-            lines += ["[[pins]]", f'entities = "{pattern}"', f'shard = "{shard}"']
-        self.file.write_text("\n".join(lines) + "\n")
+        listen = {name: f"tcp/127.0.0.1:{self._ports.free()}" for name in shards}
+        write_cell(
+            self.file,
+            "verify",
+            worlds=["online"],
+            listen=listen,
+            pins=pins,
+            session_ttl_s=ttl_s,
+            carrier=carrier,
+        )
 
     def start_shard(self, name: str) -> LineProcess:
         """Start a shard's daemon; return once it serves."""
         words = ("shard", "run", name, "--cell", str(self.file))
-        daemon = self._start(COMMAND, words, f"{name}.log")
+        daemon = self.run(COMMAND, words, self.folder / f"{name}.log")
         self.shards[name] = daemon
         daemon.expect("ready:")
         daemon.ready_s = time.monotonic()
@@ -238,24 +290,13 @@ class CellProcesses:
 
     def start_client(self, module: str, *words: str) -> LineProcess:
         """Start a client; its first word is the cell's file."""
-        log = f"client-{len(self._all)}.log"
-        return self._start(module, (str(self.file), *words), log)
-
-    def _start(self, module: str, words: Sequence[str], log: str) -> LineProcess:
-        surroundings = without_overrides(os.environ)
-        process = LineProcess(module, words, self.folder / log, environment=surroundings)
-        self._all.append(process)
-        return process
-
-    def end(self, process: LineProcess) -> None:
-        """End one process before the others."""
-        process.end()
-        self._all.remove(process)
+        self._clients += 1
+        log = self.folder / f"client-{self._clients}.log"
+        return self.run(module, (str(self.file), *words), log)
 
     def __enter__(self) -> CellProcesses:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for process in reversed(self._all):
-            process.end()
+        self.close()
         self._ports.close()

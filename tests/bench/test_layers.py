@@ -15,8 +15,8 @@ from enact_dist.bench.cases.layers import (
     HOST,
     LOCK,
     TOUCHED,
+    LayerWatch,
     Profile,
-    Watch,
     layer_times_us,
 )
 from enact_dist.bench.cases.payloads import entity, fetch, floats, store
@@ -64,7 +64,7 @@ def test_fetch_shows_its_datum_beside_the_layers(world):
 
 def test_own_time_is_without_that_of_inner_layers():
     """An outer call of 3 ms with an inner one of 20 ms has 3 ms of its own, not 23."""
-    watch = Watch()
+    watch = LayerWatch()
 
     class Layered:
         @staticmethod
@@ -89,7 +89,7 @@ def test_watch_counts_inner_calls_once_and_is_taken_off(world):
     """A watched method does what it did, is counted while watched only, and as the outer one."""
     (write,) = slots(world, 1)
     acquire, handle = CellClient.acquire, Shard.handle
-    watch = Watch()
+    watch = LayerWatch()
 
     with watch.over(CellClient, "acquire", CLIENT), watch.over(Shard, "handle", DECISIONS):
         update((write,))

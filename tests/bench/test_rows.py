@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from enact_dist.bench.floors import ECHO, FDATASYNC, QUERY
-from enact_dist.bench.rows import Case, Goal, Sample, at_most, row_of, sample_of, times
+from enact_dist.bench.rows import Case, Goal, Timings, at_most, row_of, sample_of, times
 from enact_dist.bench.run import Run
 from enact_dist.bench.timing import COUNT_MIN, timed
 
@@ -14,7 +14,7 @@ FLOOR, OTHER, MINE = ("floor", "query"), ("floor", "disk"), ("update", "mine")
 
 def figures(**medians_us):
     return {
-        {"floor": FLOOR, "disk": OTHER, "mine": MINE}[name]: Sample(median_us, 2 * median_us, 9)
+        {"floor": FLOOR, "disk": OTHER, "mine": MINE}[name]: Timings(median_us, 2 * median_us, 9)
         for name, median_us in medians_us.items()
     }
 
@@ -25,7 +25,7 @@ def case(goal=None, floor=FLOOR):
 
 def test_sample_is_median_and_99th_percentile():
     """The order of the times does not matter."""
-    assert sample_of([float(n) for n in range(200, 0, -1)]) == Sample(100.5, 199.0, 200)
+    assert sample_of([float(n) for n in range(200, 0, -1)]) == Timings(100.5, 199.0, 200)
 
 
 def test_sample_of_nothing_is_refused():
@@ -102,7 +102,7 @@ def test_goal_may_bound_the_99th_percentile_too(p99_us, met):
     """A good median does not excuse a bad tail."""
     goal = at_most(12.0, "…", p99_us=p99_us)
 
-    assert goal.met(Sample(10.0, 20.0, 9), {}) is met
+    assert goal.met(Timings(10.0, 20.0, 9), {}) is met
 
 
 def test_row_without_a_goal_has_none():

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from enact_dist import Entity, Write, connect
 from enact_dist.verify.chaos.journal import Journal
-from enact_dist.verify.chaos.workload import ASPECTS, Plan, Workload
+from enact_dist.verify.chaos.workload import ASPECTS, LockWorkload, PlannedLock
 
 
 class StoppingJournal(Journal):
@@ -27,9 +27,9 @@ def main():
     file, journal, name = sys.argv[1:]
     kind = StoppingJournal if name.startswith("stopped") else Journal
     with connect(file, actor=name, timeout_s=30.0) as cell:
-        work = Workload(cell, kind(Path(journal)), name, seed=0, ttl_s=1.0)
+        work = LockWorkload(cell, kind(Path(journal)), name, seed=0, ttl_s=1.0)
         write = Write(cell.world("online"), Entity("thing/s0/0"), ASPECTS["kept"])
-        told = work.take(Plan("write one", [write], [write], wait_s=60.0))
+        told = work.take(PlannedLock("write one", [write], [write], wait_s=60.0))
     print("said", told.value, flush=True)
 
 

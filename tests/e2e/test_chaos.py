@@ -23,7 +23,7 @@ from enact_dist.verify.chaos.cell import TestedCell
 from enact_dist.verify.chaos.figures import judge
 from enact_dist.verify.chaos.journal import Journal
 from enact_dist.verify.chaos.network.hosts import Loopback, open_hosts
-from enact_dist.verify.checker import Told
+from enact_dist.verify.checker import LockOutcome
 from enact_dist.verify.daemons import LineProcess
 
 pytestmark = pytest.mark.slow
@@ -161,7 +161,7 @@ def final_look(found):
     return next(
         lock
         for lock in found.locks.values()
-        if lock.client == evidence.FINAL and lock.told is Told.COMMITTED
+        if lock.client == evidence.FINAL and lock.told is LockOutcome.COMMITTED
     )
 
 
@@ -172,7 +172,7 @@ def part_to_leave_out(found):
         (
             (record, written)
             for record in found.locks.values()
-            if record.told is Told.COMMITTED and len(record.writes) > 1
+            if record.told is LockOutcome.COMMITTED and len(record.writes) > 1
             for written in record.writes
             if written[0].endswith("/kept") and 1 < written[1] < final[written[0]] - 3
         ),
@@ -187,7 +187,7 @@ def reader_to_move(found):
         (
             lock
             for lock in found.locks.values()
-            if lock.told is Told.COMMITTED
+            if lock.told is LockOutcome.COMMITTED
             and not lock.writes
             and any(
                 held and version < newest - 3 for at, version, _, held in lock.seen if at == slot
@@ -288,9 +288,10 @@ def test_told_not_but_visible_is_named(found):
     record = next(
         lock
         for lock in found.locks.values()
-        if lock.told is Told.COMMITTED and any(slot.endswith("/kept") for slot, *_ in lock.writes)
+        if lock.told is LockOutcome.COMMITTED
+        and any(slot.endswith("/kept") for slot, *_ in lock.writes)
     )
-    record.told = Told.NOT
+    record.told = LockOutcome.NOT
 
     assert rules(found) & {"told not committed, but visible", "versions have a gap"}
 
@@ -340,7 +341,7 @@ def zombie_commits(folder, daemon_module):
         _, status = os.waitpid(stopped.pid, os.WUNTRACED)
         assert os.WIFSTOPPED(status)
         started.append(other := start("other"))
-        assert other.expect("said") == Told.COMMITTED.value
+        assert other.expect("said") == LockOutcome.COMMITTED.value
         stopped.signal(signal.SIGCONT)
         stopped.expect("said")
         runner._rest(cell, log)

@@ -18,7 +18,7 @@ from enact_dist.errors import (
     ShardUnreachableError,
 )
 from enact_dist.link.client import locks as link_client
-from enact_dist.verify.checker import Checker, LockStory, Reading, State, Told
+from enact_dist.verify.checker import ChainState, Checker, LockOutcome, LockStory, StateRead
 
 pytestmark = pytest.mark.slow
 TTL_S = 1.0
@@ -95,19 +95,22 @@ class Skew:
             if mine == LEFT:
                 self.first_ended.set()
         self.told[str(mine)] = error
-        told = Told.NOT if error else Told.COMMITTED
+        told = LockOutcome.NOT if error else LockOutcome.COMMITTED
         self.stories.append((str(mine), str(other), base, begun_ns, time.monotonic_ns(), told))
 
     def judged(self, *, views_count_as_reads):
         """Return what the checker finds wrong; the accounts' versions before were 1."""
-        stories, chains = [], {str(LEFT): [State(1, "init", 1)], str(RIGHT): [State(1, "init", 1)]}
+        stories, chains = (
+            [],
+            {str(LEFT): [ChainState(1, "init", 1)], str(RIGHT): [ChainState(1, "init", 1)]},
+        )
         for mine, other, base, begun_ns, ended_ns, told in self.stories:
-            shown = (Reading(other, base),)
+            shown = (StateRead(other, base),)
             reads, views = (shown, ()) if views_count_as_reads else ((), shown)
-            own = (Reading(mine, 1),)
+            own = (StateRead(mine, 1),)
             stories.append(LockStory(mine, begun_ns, ended_ns, told, own + reads, views, (mine,)))
-            if told is Told.COMMITTED:
-                chains[mine].append(State(2, mine, 2))
+            if told is LockOutcome.COMMITTED:
+                chains[mine].append(ChainState(2, mine, 2))
         return Checker(stories, chains, events={"init": (0, 1)}).anomalies()
 
 

@@ -29,6 +29,7 @@ from enact_dist.core.protocol.messages import (
 )
 from enact_dist.core.shard.state import ShardSettings
 from enact_dist.link.log import in_words
+from enact_dist.link.memory.shared_folder import SharedFolder
 from enact_dist.link.socket.frames import Kind, Stream, greeting_of, send_frame
 from enact_dist.terms import Access
 
@@ -287,3 +288,11 @@ def process(program):
         return started
 
     return start
+
+
+@pytest.fixture
+def folder(shared_root):
+    """The folder that a shard shares with clients of its host."""
+    made = SharedFolder("cell", "s0", root=shared_root)
+    yield made
+    made.close()

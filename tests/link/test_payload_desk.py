@@ -1,4 +1,4 @@
-"""Payloads at a shard: drafts, their adoption by a commit, the cap, and when the files go."""
+"""Payloads at a shard: drafts, their adoption by a commit, and when the files go."""
 
 import errno
 import os
@@ -6,59 +6,30 @@ import stat
 from types import SimpleNamespace
 
 import pytest
+from payload_drafts import (
+    FILE,
+    NOTHING,
+    SESSION,
+    SIZE,
+    adopted,
+    commit_of,
+    fill,
+    names,
+    stage,
+)
 
-from enact_dist.core.protocol.datum import Datum, LockId, Slot, Token
-from enact_dist.core.protocol.messages import Commit, Refused, Stage, Staged, WriteItem
+from enact_dist.core.protocol.datum import Datum
+from enact_dist.core.protocol.messages import Refused, Stage, Staged
 from enact_dist.link.memory import payload_desk, payload_files
 from enact_dist.link.memory.maps import leftovers
 from enact_dist.link.memory.payload_desk import NO_ROOM, PayloadDesk
-from enact_dist.link.memory.shared_folder import SharedFolder
 from enact_dist.testing import ManualClock
-
-SIZE = 100_000
-SESSION = "a1b2c3"
-FILE = f"{SESSION}-1"
-NOTHING = Datum(b"", b"", 0)
-SLOT = Slot("online", "arm", "cloud")
-
-
-@pytest.fixture
-def folder(shared_root):
-    made = SharedFolder("cell", "s0", root=shared_root)
-    yield made
-    made.close()
 
 
 @pytest.fixture(params=["file", "memory"])
 def desk(request, folder):
     """A desk with a shared folder, and one without."""
     return PayloadDesk(folder if request.param == "file" else None, 10 * SIZE)
-
-
-def stage(desk, file=FILE, offset=0, total=SIZE, body=b"", session=None):
-    session = session or file.partition("-")[0]
-    return desk.stage(Stage(session, file, offset, total, Datum(b"", body, len(body))))
-
-
-def commit_of(file=FILE, size=SIZE, session=SESSION, body=b""):
-    write = WriteItem(SLOT, Datum(b"\x01", body, size, 7, file))
-    return Commit(LockId(session, 0, 1), Token(1, 1), (write,), 0)
-
-
-def adopted(desk, *arguments, **options):
-    """Return the datum that the shard would see."""
-    return desk.with_bodies(commit_of(*arguments, **options)).writes[0].datum
-
-
-def fill(folder, content, file=FILE):
-    with (folder.path / file).open("r+b") as opened:
-        opened.write(content)
-
-
-def names(folder):
-    """Return the payloads in a folder once nothing is on its way out."""
-    assert leftovers().wait(30)
-    return sorted(file.name for file in folder.path.iterdir() if file.name != "nonce")
 
 
 # ---------------------------------------------------------------- drafts
@@ -322,169 +293,6 @@ def test_file_goes_with_the_last_datum_and_reader(folder):
     assert names(folder) == []
     assert desk.figures()["payload_bytes"] == desk.figures()["payload_files"] == 0
     assert adopted(desk).body == b"", "a late copy finds nothing"
-
-
-# ---------------------------------------------------------------- the cap
-
-
-def test_payload_over_the_cap_is_refused_by_name(folder):
-    """Nothing is made; the text says what was asked, what is there, who has it, what to do."""
-    desk = PayloadDesk(folder, 2 * SIZE, biggest=lambda: "; the largest: online:arm/cloud 100000")
-    stage(desk, "a-1")
-    stage(desk, "a-2")
-
-    answer = stage(desk, "b-1")
-
-    assert isinstance(answer, Refused)
-    assert answer.code == NO_ROOM
-    for part in (
-        "100000 bytes",
-        "200000 of at most 200000",
-        "online:arm/cloud",
-        "shared_bytes_max",
-    ):
-        assert part in answer.text
-    assert names(folder) == ["a-1", "a-2"]
-    assert desk.figures()["payloads_refused"] == 1
-
-
-def test_history_goes_before_a_payload_is_refused(folder):
-    """The shard is asked for room once, and its files are waited for."""
-    kept = []
-    desk = PayloadDesk(folder, 2 * SIZE, make_room=lambda _: kept.pop(0))
-    for number in (1, 2):
-        stage(desk, f"{SESSION}-{number}", body=b"x" * SIZE)
-        kept.append(adopted(desk, f"{SESSION}-{number}"))
-
-    assert stage(desk, f"{SESSION}-3") == Staged(f"{SESSION}-3", 0, True)
-    assert names(folder) == [f"{SESSION}-2", f"{SESSION}-3"]
-
-
-def test_room_that_another_payload_takes_first_is_made_again(folder):
-    """Cameras come at one moment: what goes for one of them may be had by the next."""
-    kept, asked = [], []
-
-    def make_room(size):
-        asked.append(size)
-        kept.pop(0)
-        if len(asked) == 1:
-            assert stage(desk, next_one) == Staged(next_one, 0, True)
-
-    desk = PayloadDesk(folder, 2 * SIZE, make_room=make_room)
-    # One that is opened under the same mutex would wait, here for its own thread.
-    mutexes = len(desk._opening)
-    others = (f"{SESSION}-{number}" for number in range(4, 1000))
-    next_one = next(o for o in others if (hash(o) - hash(f"{SESSION}-3")) % mutexes)
-    for number in (1, 2):
-        stage(desk, f"{SESSION}-{number}", body=b"x" * SIZE)
-        kept.append(adopted(desk, f"{SESSION}-{number}"))
-
-    assert stage(desk, f"{SESSION}-3") == Staged(f"{SESSION}-3", 0, True)
-    assert asked == [SIZE, 2 * SIZE]
-    assert names(folder) == sorted([f"{SESSION}-3", next_one])
-
-
-def test_room_that_comes_and_goes_by_itself_ends_no_search_for_more(folder, monkeypatch):
-    """Nothing had to go for it then, which does not mean that history has nothing to give."""
-    kept, asked = [], []
-
-    def make_room(size):
-        asked.append(size)
-        kept.clear()
-
-    desk = PayloadDesk(folder, 2 * SIZE, make_room=make_room)
-    stage(desk, f"{SESSION}-1", body=b"x" * SIZE)
-    kept.append(adopted(desk, f"{SESSION}-1"))
-    stage(desk, f"{SESSION}-2")
-    take, looks = desk._reserved, []
-
-    def reserved(total):
-        looks.append(total)
-        if len(looks) == 2:
-            assert take(total)  # another payload is faster
-        found = take(total)
-        if len(looks) == 1:
-            desk.drop(f"{SESSION}-2")
-            assert leftovers().wait(30)
-        return found
-
-    monkeypatch.setattr(desk, "_reserved", reserved)
-    assert stage(desk, f"{SESSION}-3") == Staged(f"{SESSION}-3", 0, True)
-    assert (asked, len(looks)) == ([SIZE], 3)
-
-
-def test_client_that_asks_again_and_again_delays_nobody(folder):
-    """History is looked through once for what cannot fit; what is smaller is another matter."""
-    asked = []
-    desk = PayloadDesk(folder, SIZE, make_room=asked.append)
-    for number in range(5):
-        assert stage(desk, f"a-{number}", total=2 * SIZE).code == NO_ROOM
-
-    assert asked == [SIZE]
-    stage(desk, "b-1")
-    assert stage(desk, "b-2").code == NO_ROOM
-    assert asked == [SIZE, SIZE]
-
-
-def test_cap_that_nobody_has_set_refuses_nothing(folder):
-    """What is beyond half of a small folder lies in plain memory, and the next small one there."""
-    desk = PayloadDesk(folder, 2 * SIZE, firm=False)
-
-    assert stage(desk, "a-1", total=3 * SIZE) == Staged("a-1", 0, False)
-    assert stage(desk, "a-2") == Staged("a-2", 0, True)
-    assert names(folder) == ["a-2"]
-
-
-def test_drafts_in_plain_memory_are_bounded():
-    """A client that stages and never commits cannot fill the shard."""
-    desk = PayloadDesk(None, 2 * SIZE)
-    for number in (1, 2):
-        assert isinstance(stage(desk, f"a-{number}"), Staged)
-
-    assert stage(desk, "a-3").code == NO_ROOM
-    stage(desk, "a-2", total=0)
-    assert isinstance(stage(desk, "a-3"), Staged)
-
-
-@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES])
-def test_folder_that_takes_no_file_costs_no_commit(folder, monkeypatch, code):
-    """The bytes then come in slices and lie in plain memory; it is counted."""
-
-    def refuse(*_):
-        raise OSError(code, os.strerror(code))
-
-    monkeypatch.setattr(os, "posix_fallocate", refuse)
-    desk = PayloadDesk(folder, 10 * SIZE)
-
-    assert stage(desk, body=b"x" * SIZE) == Staged(FILE, SIZE, False)
-
-    assert bytes(adopted(desk).body) == b"x" * SIZE
-    assert names(folder) == []
-    assert desk.figures()["payload_fallbacks"] == 1
-
-
-def test_full_folder_is_told_once_a_minute(folder, monkeypatch, caplog):
-    """A camera would fill the log with it; each payload is counted all the same."""
-
-    def refuse(*_):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, "posix_fallocate", refuse)
-    clock = ManualClock()
-    desk = PayloadDesk(folder, 10 * SIZE, clock=clock)
-    said = (
-        f"large data go over the network because the shared folder {folder.path} takes none:"
-        " No space left on device"
-    )
-
-    for number in (1, 2, 3):
-        stage(desk, f"a-{number}")
-    assert caplog.messages == [said]
-
-    clock.advance(61.0)
-    stage(desk, "a-4")
-    assert caplog.messages == [said, said]
-    assert desk.figures()["payload_fallbacks"] == 4
 
 
 def test_draft_whose_file_somebody_has_removed_is_no_payload(folder):

@@ -25,8 +25,8 @@ from enact_dist.errors import LinkError, LockTimeoutError
 from enact_dist.link.client import locks as link_client
 from enact_dist.link.clock import boottime_ns
 from enact_dist.verify.chaos.journal import Journal
-from enact_dist.verify.chaos.workload import ASPECTS, Plan, Workload, datum_text
-from enact_dist.verify.checker import Told
+from enact_dist.verify.chaos.workload import ASPECTS, LockWorkload, PlannedLock, datum_text
+from enact_dist.verify.checker import LockOutcome
 
 SUSPENDED_NS = 10**9
 PROBE_S = 0.01
@@ -51,7 +51,7 @@ class SuspendedClock:
             return now_ns - self._missed_ns
 
 
-class HeldWorkload(Workload):
+class HeldWorkload(LockWorkload):
     """Waits for a word between the grant and the commit."""
 
     def __init__(self, *arguments, **options):
@@ -161,7 +161,7 @@ class Client:
         """Commit so many times, again where a slow machine or network cost the lock."""
         committed = 0
         for _ in range(TRIES * count):
-            committed += self._work.take(self._plan("s0,s1")) is Told.COMMITTED
+            committed += self._work.take(self._plan("s0,s1")) is LockOutcome.COMMITTED
             if committed == count:
                 break
         return committed
@@ -175,7 +175,7 @@ class Client:
     def _plan(self, shards):
         world, aspect = self._cell.world("online"), ASPECTS["kept"]
         writes = [Write(world, Entity(f"thing/{s}/1"), aspect) for s in shards.split(",")]
-        return Plan("write over shards", list(writes), writes, wait_s=60.0, hold_s=120.0)
+        return PlannedLock("write over shards", list(writes), writes, wait_s=60.0, hold_s=120.0)
 
 
 def main():

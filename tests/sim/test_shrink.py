@@ -10,7 +10,7 @@ import pytest
 from enact_dist.cli.main import build_parser
 from enact_dist.verify.simulation.command import part_of
 from enact_dist.verify.simulation.scenario import Scenario
-from enact_dist.verify.simulation.schedule import WHOLE, Part
+from enact_dist.verify.simulation.schedule import WHOLE, PartOfRun
 from enact_dist.verify.simulation.shrink import command, reduced, shrink
 
 
@@ -38,7 +38,7 @@ def test_list_is_reduced_to_what_is_needed(needed):
 def test_run_with_all_its_faults_and_locks_is_the_same_run():
     """A part that leaves nothing out changes nothing."""
     whole = run(11)
-    part = Part(
+    part = PartOfRun(
         only=frozenset(fault.name for fault in whole.faults),
         locks=frozenset(whole.locks),
         until_s=25.0,
@@ -59,7 +59,7 @@ def test_run_with_all_its_faults_and_locks_is_the_same_run():
 
 def test_run_without_faults_has_none():
     """Every fault of a run has a name: with an empty list nothing goes wrong."""
-    tally = run(11, Part(only=frozenset())).tally
+    tally = run(11, PartOfRun(only=frozenset())).tally
 
     assert tally["commits"] > 0
     for name in ("lost", "duplicated", "delayed", "crashes", "power cuts", "pauses", "cut"):
@@ -72,7 +72,7 @@ def test_fault_that_is_left_out_changes_nothing_before_it():
     """Places have luck of their own: up to the fault that is left out, two runs are one."""
     whole = run(11)
     gone = whole.faults[len(whole.faults) // 2]
-    rest = run(11, Part(only=frozenset(f.name for f in whole.faults if f is not gone)))
+    rest = run(11, PartOfRun(only=frozenset(f.name for f in whole.faults if f is not gone)))
 
     before = [fault for fault in whole.faults if fault.at_ns < gone.at_ns]
     assert len(before) > 10
@@ -100,9 +100,11 @@ def test_failure_shrinks_to_a_short_schedule_of_the_same_rule(mutant):
     "part",
     [
         WHOLE,
-        Part(only=frozenset()),
-        Part(only=frozenset({"crash.1", "c1-s0.37"}), locks=frozenset({"c1/0.5", "c2_1/1.12"})),
-        Part(clients=frozenset({1, 3}), until_s=3.5),
+        PartOfRun(only=frozenset()),
+        PartOfRun(
+            only=frozenset({"crash.1", "c1-s0.37"}), locks=frozenset({"c1/0.5", "c2_1/1.12"})
+        ),
+        PartOfRun(clients=frozenset({1, 3}), until_s=3.5),
     ],
 )
 def test_printed_command_asks_for_the_same_part(part):

@@ -13,7 +13,7 @@ from enact_dist.core.protocol.records import Persist, SessionRecord
 from enact_dist.terms import Access, Durability
 from enact_dist.verify.simulation.faults import NONE, drawn
 from enact_dist.verify.simulation.hosts.disk import Disk
-from enact_dist.verify.simulation.hosts.world import Clock, Host, S, World
+from enact_dist.verify.simulation.hosts.world import DriftingClock, Host, S, SimulatedWorld
 from enact_dist.verify.simulation.judges.history import conflict
 from enact_dist.verify.simulation.scenario import Scenario
 from enact_dist.verify.simulation.schedule import Schedule
@@ -59,7 +59,7 @@ def test_run_without_faults_loses_nothing():
 @pytest.mark.parametrize("ppm", [-10_000, 0, 10_000])
 def test_clock_turns_durations_into_true_time(ppm):
     """A clock that is fast or slow agrees with itself."""
-    clock = Clock(5, ppm)
+    clock = DriftingClock(5, ppm)
     true_ns = clock.true_duration(S)
 
     assert clock.at(true_ns) - clock.at(0) in range(S, S + 3)
@@ -67,7 +67,7 @@ def test_clock_turns_durations_into_true_time(ppm):
 
 def test_paused_host_handles_afterwards_what_arrived_meanwhile():
     """A pause loses nothing and keeps the order."""
-    world = World(Schedule(0))
+    world = SimulatedWorld(Schedule(0))
     host = Host(world, "h", drift_ppm=0, wall_offset_ns=0)
     seen: list[int] = []
     host.pause(S)
@@ -83,7 +83,7 @@ def test_paused_host_handles_afterwards_what_arrived_meanwhile():
 
 def test_restarted_host_forgets_what_it_had_planned():
     """A new life knows nothing of the old one's timers."""
-    world = World(Schedule(0))
+    world = SimulatedWorld(Schedule(0))
     host = Host(world, "h", drift_ppm=0, wall_offset_ns=0)
     seen: list[int] = []
     host.later(S, lambda: seen.append(1))
@@ -97,7 +97,7 @@ def test_restarted_host_forgets_what_it_had_planned():
 @pytest.mark.parametrize("seed", range(20))
 def test_crash_keeps_a_prefix_and_what_was_reported(seed):
     """A disk loses no durable record that it reported, and nothing in the middle."""
-    world = World(Schedule(seed))
+    world = SimulatedWorld(Schedule(seed))
     host = Host(world, "h", drift_ppm=0, wall_offset_ns=0)
     disk, done = Disk(world, NONE, "h"), []
     for number in range(1, 9):

@@ -10,7 +10,7 @@ from enact_dist.terms import Access
 from enact_dist.verify.chaos import chains, evidence, figures, watcher
 from enact_dist.verify.chaos.journal import SUFFIX, UNSEEN, Journal, read_lines
 from enact_dist.verify.chaos.network import hosts
-from enact_dist.verify.checker import Told
+from enact_dist.verify.checker import LockOutcome
 
 KEPT, OTHER, FRAME = (
     "online:thing/s0/0/kept",
@@ -108,7 +108,7 @@ def test_version_that_nobody_saw_belongs_to_who_was_told_so(recorded):
     recorded.lock("b.1", reads=[(KEPT, 1, UNSEEN)], writes=[(KEPT, 2, "b.1")])
     recorded.lock("b.2", reads=[(KEPT, 2, "b.1")])
 
-    history = chains.History(recorded.loaded())
+    history = chains.CheckedHistory(recorded.loaded())
 
     assert [state.writer for state in history.chains[KEPT]] == ["a.1", "b.1"]
     assert history.anomalies() == []
@@ -194,7 +194,7 @@ def test_volatile_slot_starts_anew_with_its_shard(recorded):
     recorded.lock("b.1", reads=[(FRAME, 1, "a.2")], writes=[(FRAME, 2, "b.1")])
     recorded.lock("b.2", views=[(FRAME, 2, "b.1")], reads=[(OTHER, 1, "a.2")])
 
-    history = chains.History(recorded.loaded())
+    history = chains.CheckedHistory(recorded.loaded())
 
     writers = [state.writer for state in history.chains[FRAME]]
     assert writers == ["a.1", "restart 8 of s0 under a.2", "a.2", "b.1"]
@@ -208,7 +208,7 @@ def test_promise_may_be_applied_after_two_restarts(recorded):
     recorded.restart("s0", 9, down_ns=recorded.now + 1)
     recorded.lock("b.1", reads=[(FRAME, 1, "a.1"), (OTHER, 1, "a.1")])
 
-    history = chains.History(recorded.loaded())
+    history = chains.CheckedHistory(recorded.loaded())
 
     names = [f"restart {epoch} of s0 under a.1" for epoch in (8, 9)]
     assert [state.writer for state in history.chains[FRAME]] == [*names, "a.1"]
@@ -237,7 +237,7 @@ def test_promise_over_a_restart_may_be_known_from_a_view_alone(recorded):
     """Promised as version 1, applied as version 1 of the next epoch, and only a view shows it."""
     assert viewed_after_restart(recorded, OVER_SHARDS) == []
 
-    history = chains.History(recorded.loaded())
+    history = chains.CheckedHistory(recorded.loaded())
     writers = [state.writer for state in history.chains[FRAME]]
     assert writers == ["restart 8 of s0 under a.1", "a.1"]
 
@@ -378,4 +378,4 @@ def test_without_namespaces_what_is_left_out_is_named(monkeypatch):
 
 def test_told_has_the_words_of_the_journal():
     """What journals say is what the checker understands."""
-    assert {told.value for told in Told} == {"committed", "not committed", "unknown"}
+    assert {told.value for told in LockOutcome} == {"committed", "not committed", "unknown"}

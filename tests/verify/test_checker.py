@@ -6,12 +6,12 @@ import pytest
 
 from enact_dist.verify.checker import (
     NOTHING,
-    Captured,
+    CapturedRead,
+    ChainState,
     Checker,
+    LockOutcome,
     LockStory,
-    Reading,
-    State,
-    Told,
+    StateRead,
     name_of,
 )
 
@@ -26,7 +26,15 @@ class HandMade:
         self.lost = set()
 
     def lock(
-        self, name, *, at=(0, 100), told=Told.COMMITTED, reads=(), views=(), writes=(), **more
+        self,
+        name,
+        *,
+        at=(0, 100),
+        told=LockOutcome.COMMITTED,
+        reads=(),
+        views=(),
+        writes=(),
+        **more,
     ):
         """Add a lock; readings are written `slot@writer`, and `slot@` for the state before all."""
         self.stories.append(
@@ -36,7 +44,7 @@ class HandMade:
 
     def chain(self, slot, *writers, versions=None):
         versions = versions or range(1, len(writers) + 1)
-        self.chains[slot] = [State(w, w, v) for w, v in zip(writers, versions, strict=True)]
+        self.chains[slot] = [ChainState(w, w, v) for w, v in zip(writers, versions, strict=True)]
         return self
 
     def checker(self):
@@ -48,7 +56,7 @@ class HandMade:
 
 def _read(words):
     parts = [word.split("@") for word in words]
-    return [Reading(slot, name or NOTHING) for slot, name in parts]
+    return [StateRead(slot, name or NOTHING) for slot, name in parts]
 
 
 @pytest.fixture
@@ -61,8 +69,8 @@ def test_sound_history_passes(told):
     told.lock("a", at=(0, 10), writes=["x", "y"], reads=["x@", "y@"])
     told.lock("b", at=(11, 20), writes=["x"], reads=["x@a", "y@a"], views=["x@a", "y@a"])
     told.lock("c", at=(12, 30), reads=["y@a"], views=["x@b", "y@a"])
-    told.lock("never ended", at=(5, None), told=Told.UNKNOWN, writes=["x"])
-    told.lock("timed out", at=(5, 6), told=Told.NOT, writes=["x"])
+    told.lock("never ended", at=(5, None), told=LockOutcome.UNKNOWN, writes=["x"])
+    told.lock("timed out", at=(5, 6), told=LockOutcome.NOT, writes=["x"])
     told.events["restart"] = (40, 41)
     told.chain("x", "a", "b").chain("y", "a").chain("v", "a", "restart", "b", versions=[1, 0, 1])
     told.chain("v", "a", "restart", versions=[1, 0])
@@ -128,21 +136,21 @@ def test_view_of_half_a_commit_is_named(told):
 
 def test_half_a_commit_is_named(told):
     """A commit that is in one slot and not in the other; nobody was told anything."""
-    told.lock("a", at=(0, None), told=Told.UNKNOWN, writes=["x", "y"]).chain("x", "a")
+    told.lock("a", at=(0, None), told=LockOutcome.UNKNOWN, writes=["x", "y"]).chain("x", "a")
 
     assert told.rules() == ["half a commit"]
 
 
 def test_dirty_read_is_named(told):
     """A committed lock read what nobody committed."""
-    told.lock("a", told=Told.NOT, writes=["x"]).lock("b", reads=["x@a"])
+    told.lock("a", told=LockOutcome.NOT, writes=["x"]).lock("b", reads=["x@a"])
 
     assert told.rules() == ["dirty read"]
 
 
 def test_visible_though_told_not_is_named(told):
     """Who was told that nothing was written must not find it."""
-    told.lock("a", told=Told.NOT, writes=["x"]).chain("x", "a")
+    told.lock("a", told=LockOutcome.NOT, writes=["x"]).chain("x", "a")
 
     assert told.rules() == ["told not committed, but visible"]
 
@@ -253,12 +261,12 @@ def test_names_of_cycles_cover_every_kind():
 def test_set_that_shows_half_of_a_commit_is_told(told):
     """One commit captured both; the set has its datum in one slot and an older one in the other."""
     told.lock("a", writes=["x", "y"]).lock("b", writes=["x", "y"])
-    told.chains["x"] = [State("a", "a", 1, 7), State("b", "b", 2, 7)]
-    told.chains["y"] = [State("a", "a", 1, 7), State("b", "b", 2, 7)]
-    told.lock("whole", captured=[Captured("x", "b", 7), Captured("y", "b", 7)])
+    told.chains["x"] = [ChainState("a", "a", 1, 7), ChainState("b", "b", 2, 7)]
+    told.chains["y"] = [ChainState("a", "a", 1, 7), ChainState("b", "b", 2, 7)]
+    told.lock("whole", captured=[CapturedRead("x", "b", 7), CapturedRead("y", "b", 7)])
     assert told.rules() == []
 
-    told.lock("half", captured=[Captured("x", "b", 7), Captured("y", "a", 7)])
+    told.lock("half", captured=[CapturedRead("x", "b", 7), CapturedRead("y", "a", 7)])
     assert told.rules() == ["a set shows half a commit"]
 
 
@@ -266,8 +274,8 @@ def test_set_beside_a_view_of_the_same_commit_is_told(told):
     """What a view shows is there, so its other half is not older either."""
     told.lock("a", writes=["y"]).lock("b", writes=["x", "y"])
     told.chain("x", "b")
-    told.chains["y"] = [State("a", "a", 1, 7), State("b", "b", 2, 7)]
-    told.lock("half", views=["x@b"], captured=[Captured("y", "a", 7)])
+    told.chains["y"] = [ChainState("a", "a", 1, 7), ChainState("b", "b", 2, 7)]
+    told.lock("half", views=["x@b"], captured=[CapturedRead("y", "a", 7)])
 
     assert told.rules() == ["a set shows half a commit"]
 
@@ -275,9 +283,9 @@ def test_set_beside_a_view_of_the_same_commit_is_told(told):
 def test_datum_of_another_stamp_is_told(told):
     """A set has nothing in it but its own stamp; what is not retained is no fault."""
     told.lock("a", writes=["x"])
-    told.chains["x"] = [State("a", "a", 1, 7)]
-    told.lock("gone", captured=[Captured("x", NOTHING, 8)])
+    told.chains["x"] = [ChainState("a", "a", 1, 7)]
+    told.lock("gone", captured=[CapturedRead("x", NOTHING, 8)])
     assert told.rules() == []
 
-    told.lock("wrong", captured=[Captured("x", "a", 8)])
+    told.lock("wrong", captured=[CapturedRead("x", "a", 8)])
     assert told.rules() == ["another stamp was shown"]

@@ -9,7 +9,7 @@ from enact_dist.config.read import load_config
 from enact_dist.errors import LinkError
 from enact_dist.verify.chaos.network.hosts import Loopback
 from enact_dist.verify.chaos.watcher import Watcher
-from enact_dist.verify.checker import Told
+from enact_dist.verify.checker import LockOutcome
 from enact_dist.verify.daemons import CellProcesses, LineProcess, last_said
 
 
@@ -68,7 +68,7 @@ def test_last_look_of_a_run_is_taken_again_where_its_lock_was_lost(tmp_path):
     """A machine that lets the watcher wait for longer than a lease shows no fault of the cell."""
 
     class Look:
-        told = iter((Told.NOT, Told.UNKNOWN, Told.COMMITTED))
+        told = iter((LockOutcome.NOT, LockOutcome.UNKNOWN, LockOutcome.COMMITTED))
 
         def take_all(self):
             return next(self.told)
@@ -79,7 +79,7 @@ def test_last_look_of_a_run_is_taken_again_where_its_lock_was_lost(tmp_path):
     watcher = Watcher(Cell(), tmp_path, ttl_s=1.0, ahead_ns=0)
     watcher._final = Look()
 
-    assert watcher.final() == Told.COMMITTED.value
+    assert watcher.final() == LockOutcome.COMMITTED.value
 
 
 def test_process_that_fails_is_told_by_what_was_wrong(tmp_path):

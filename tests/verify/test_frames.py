@@ -12,7 +12,7 @@ from enact_dist.core.shard import inspection
 from enact_dist.core.shard.on_lock import LockDesk
 from enact_dist.core.shard.shard import Shard
 from enact_dist.verify.frames.hostile import KINDS
-from enact_dist.verify.frames.lives import STORE_EVERY, Broken, Tally, live
+from enact_dist.verify.frames.lives import STORE_EVERY, BrokenLife, LifeTally, live
 from enact_dist.verify.simulation.series import fresh_seed
 
 LIVES = 48
@@ -24,12 +24,12 @@ def test_shards_live_through_fresh_hostile_frames(part):
     first = fresh_seed() + part * LIVES
 
     for seed in range(first, first + LIVES):
-        live(seed, Tally())
+        live(seed, LifeTally())
 
 
 def test_hostile_frames_get_everywhere():
     """Every kind of request is asked, locks are granted and commits made, folders read again."""
-    tally = Tally()
+    tally = LifeTally()
     for seed in range(2 * STORE_EVERY * 2):
         live(seed, tally)
 
@@ -43,7 +43,7 @@ def test_hostile_frames_get_everywhere():
 
 def test_the_seed_of_a_core_repeats_its_life():
     """What one machine has found, another one can look at."""
-    once, again = Tally(), Tally()
+    once, again = LifeTally(), LifeTally()
     for tally in (once, again):
         live(5, tally)
 
@@ -73,9 +73,9 @@ def test_fault_is_found_and_named(fault, monkeypatch, capsys):
     """The command says which frame it was, ends with 1, and repeats the life by its seed."""
     owner, name, wrong, said = FAULTS[fault]
     monkeypatch.setattr(owner, name, wrong)
-    with pytest.raises(Broken, match=f"(?s){said}"):
+    with pytest.raises(BrokenLife, match=f"(?s){said}"):
         for seed in range(40):
-            live(seed, Tally())
+            live(seed, LifeTally())
 
     assert main(["verify", "--frames", "--seeds", "40", "--first", "0", "--json"]) == 1
     (failure,) = json.loads(capsys.readouterr().out)["failures"]

@@ -67,7 +67,7 @@ LAYERS: Final = (LOCK, CLIENT, CALLS, HOST, DECISIONS, FETCHED, DECODED, TOUCHED
 WOKEN_SIZE: Final = "0.9 MB"
 
 
-class Watch:
+class LayerWatch:
     """Adds up how long the calls of each layer take in one thread, less the watched calls in them.
 
     Attributes:
@@ -223,7 +223,7 @@ def layer_times_us(
         profile: The act.
         seconds_s: How long to go on.
     """
-    watch = Watch()
+    watch = LayerWatch()
     carrier = type(profile.world.session.client.carrier)
     before = profile.before or (lambda: None)
     with contextlib.ExitStack() as stack:

@@ -12,7 +12,7 @@ from enact_dist.bench.rows import value_row
 from enact_dist.errors import MisuseError
 
 if TYPE_CHECKING:
-    from enact_dist.bench.run import Asked, Run
+    from enact_dist.bench.run import PackingOptions, Run
 
 NAME: Final = "palletizing"
 
@@ -70,7 +70,7 @@ def run_palletizing(run: Run) -> None:
         run.add_row(value_row(NAME, title, count, "places", asked.packages))
 
 
-def _score_perception(run: Run, asked: Asked) -> None:
+def _score_perception(run: Run, asked: PackingOptions) -> None:
     """Judge drawn packages, over noise and light of the sensor; no robot, no physics."""
     from actors.palletizing import perception_scores as scores
 

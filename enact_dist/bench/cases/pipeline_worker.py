@@ -100,7 +100,7 @@ def tick_of_set(masks: Sequence[NDArray[np.uint8]], areas: Sequence[Sequence[int
     return tick if found == [area[tick % FRAMES] for area in areas] else None
 
 
-class Kept:
+class FixedRows:
     """Rows of integers, in memory that is taken and touched before the run: they do not grow it.
 
     Args:
@@ -153,7 +153,7 @@ def _camera(cell: Cell, options: dict[str, Any]) -> None:
     with Lock(write, wait_s=WAIT_S) as lock:  # a null datum: registers the aspect, and connects
         del lock[write]
     ticks = _started(options)
-    stored = Kept(ticks.count, 3)
+    stored = FixedRows(ticks.count, 3)
     for tick in range(ticks.count):
         ticks.wait(tick)
         np.copyto(image, frames[tick % FRAMES])  # a driver's copy out of its ring
@@ -182,7 +182,7 @@ def _segmenter(cell: Cell, options: dict[str, Any]) -> None:
             if tick == options["ticks"] - 1:
                 stop.set()
 
-    done = Kept(options["ticks"] + AGAIN_MAX, 2)
+    done = FixedRows(options["ticks"] + AGAIN_MAX, 2)
     stop = threading.Event()
     _run_actor(Segmenter(), cell, options, stop, lambda: {"ticks": done.told()})
 
@@ -206,7 +206,7 @@ def _consumer(cell: Cell, options: dict[str, Any]) -> None:
             if tick == options["ticks"] - 1:
                 stop.set()
 
-    sets = Kept(options["ticks"] + AGAIN_MAX, 3)
+    sets = FixedRows(options["ticks"] + AGAIN_MAX, 3)
     torn: list[int] = []
     areas = areas_of_frames()
     stop = threading.Event()

@@ -15,8 +15,8 @@ from __future__ import annotations
 
 import json
 import sys
-import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -85,32 +85,22 @@ def _wait(world: WorldContext, options: dict[str, Any]) -> None:
     sys.stdin.readline()
     end_s = time.monotonic() + options["seconds_s"]
     held: list[tuple[int, int]] = []
-    failed: list[BaseException] = []
 
-    def queue_up() -> None:
-        try:
-            while time.monotonic() < end_s:
-                with Lock(write, wait_s=WAIT_S) as lock:
-                    granted_ns = time.perf_counter_ns()
-                    lock[write] = lock.get(write, 0) + 1
-                    left_ns = time.perf_counter_ns()
-                held.append((granted_ns, left_ns))
-        except BaseException as error:  # noqa: BLE001 (raised again below)
-            failed.append(error)
+    def queue_up(_number: int) -> None:
+        while time.monotonic() < end_s:
+            with Lock(write, wait_s=WAIT_S) as lock:
+                granted_ns = time.perf_counter_ns()
+                lock[write] = lock.get(write, 0) + 1
+                left_ns = time.perf_counter_ns()
+            held.append((granted_ns, left_ns))
 
-    threads = [threading.Thread(target=queue_up) for _ in range(options["threads"])]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    if failed:
-        raise failed[0]
+    _side_by_side(queue_up, options["threads"])
     print("held:", said(held), flush=True)
     sys.stdin.read()
 
 
 def _film(world: WorldContext, options: dict[str, Any]) -> None:
-    late, failed = [0] * CAMERAS, list[BaseException]()
+    late = [0] * CAMERAS
     images = [np.full(IMAGE_BYTES, camera, np.uint8) for camera in range(CAMERAS)]
     writes = [
         [Write(world, Entity(f"history/camera/{camera}"), aspect) for aspect in IMAGES]
@@ -120,27 +110,24 @@ def _film(world: WorldContext, options: dict[str, Any]) -> None:
     start_ns = int(sys.stdin.readline())
 
     def film(camera: int) -> None:
-        try:
-            for tick in range(options["ticks"]):
-                due_ns = start_ns + tick * PERIOD_NS
-                sleep_until(due_ns)
-                write = writes[camera][side_of(tick)]
-                images[camera][:8].view(np.int64)[0] = tick
-                with Lock(write, wait_s=WAIT_S) as lock:
-                    lock.put(write, images[camera], stamp_ns=tick + 1)
-                late[camera] += time.perf_counter_ns() > due_ns + PERIOD_NS
-        except BaseException as error:  # noqa: BLE001 (raised again below)
-            failed.append(error)
+        for tick in range(options["ticks"]):
+            due_ns = start_ns + tick * PERIOD_NS
+            sleep_until(due_ns)
+            write = writes[camera][side_of(tick)]
+            images[camera][:8].view(np.int64)[0] = tick
+            with Lock(write, wait_s=WAIT_S) as lock:
+                lock.put(write, images[camera], stamp_ns=tick + 1)
+            late[camera] += time.perf_counter_ns() > due_ns + PERIOD_NS
 
-    threads = [threading.Thread(target=film, args=(camera,)) for camera in range(CAMERAS)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    if failed:
-        raise failed[0]
+    _side_by_side(film, CAMERAS)
     print("did:", said(late), flush=True)
     sys.stdin.read()
+
+
+def _side_by_side(act: Callable[[int], None], count: int) -> None:
+    """Let so many threads act at once, each with its number; raise what one of them raises."""
+    with ThreadPoolExecutor(count) as pool:
+        list(pool.map(act, range(count)))
 
 
 _ROLES: Final[dict[str, Callable[[WorldContext, dict[str, Any]], None]]] = {

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-class Part(NamedTuple):
+class DatumPart(NamedTuple):
     """A part of a datum and the fields that stand beside it."""
 
     value: object
@@ -31,9 +31,9 @@ def part_at(value: object, path: str) -> object:
     return value
 
 
-def parts_of(value: object, beside: Mapping[str, object]) -> Iterator[Part]:
+def parts_of(value: object, beside: Mapping[str, object]) -> Iterator[DatumPart]:
     """Yield a value and all that it consists of, in the order of its fields."""
-    yield Part(value, beside)
+    yield DatumPart(value, beside)
     if isinstance(value, dict):
         for each in value.values():
             yield from parts_of(each, value)

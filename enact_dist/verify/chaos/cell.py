@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import threading
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.config.environment import without_overrides
 from enact_dist.errors import LinkError
 from enact_dist.verify.chaos import daemon
 from enact_dist.verify.chaos.journal import SUFFIX
 from enact_dist.verify.chaos.workload import WORLDS
-from enact_dist.verify.daemons import LineProcess
+from enact_dist.verify.daemons import LineProcess, Processes, write_cell
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -46,7 +44,7 @@ class ShardProcess:
 
 
 @dataclass(slots=True)
-class Client:
+class StartedClient:
     """A client process; `incarnation` counts its starts."""
 
     name: str
@@ -55,7 +53,7 @@ class Client:
     incarnation: int = 1
 
 
-class TestedCell:
+class TestedCell(Processes):
     """All processes of one run.
 
     Args:
@@ -81,25 +79,21 @@ class TestedCell:
         seed: int,
         daemon_module: str = daemon.MODULE,
     ) -> None:
+        super().__init__()
         self._folder, self._hosts, self._log = folder, hosts, log
         self._ttl_s, self._seed, self._module = ttl_s, seed, daemon_module
-        self._all: list[LineProcess] = []
         self.file = folder / "cell.toml"
         self.shards: dict[str, ShardProcess] = {}
-        self.clients: dict[str, Client] = {}
+        self.clients: dict[str, StartedClient] = {}
         self.watcher: LineProcess
-        worlds = ", ".join(f'"{world}"' for world in WORLDS)
-        lines = [
-            'name = "chaos"',
-            f"worlds = [{worlds}]",
-            f"session_ttl_s = {ttl_s}",
-            f'data_folder = "{folder}/data"',
-        ]
-        for name in shards:
-            lines += [f"[shards.{name}]", f'listen = "{hosts.endpoint(name)}"']
-        for name in shards:
-            lines += ["[[pins]]", f'entities = "thing/{name}/*"', f'shard = "{name}"']
-        self.file.write_text("\n".join(lines) + "\n")
+        write_cell(
+            self.file,
+            "chaos",
+            worlds=WORLDS,
+            listen={name: hosts.endpoint(name) for name in shards},
+            pins={f"thing/{name}/*": name for name in shards},
+            session_ttl_s=ttl_s,
+        )
 
     # ---------------------------------------------------------------- starts
 
@@ -172,9 +166,9 @@ class TestedCell:
             str(2 + index % 2),
         )
         process = self._run(CLIENT, words, name, host)
-        self.clients[name] = Client(name, host, process, incarnation)
+        self.clients[name] = StartedClient(name, host, process, incarnation)
 
-    def journal_of(self, client: Client) -> Path:
+    def journal_of(self, client: StartedClient) -> Path:
         """Return the journal of a client process; it exists once the process has started."""
         return self._journal(f"{client.name}.{client.incarnation}")
 
@@ -183,22 +177,9 @@ class TestedCell:
 
     def _run(self, module: str, words: tuple[str, ...], name: str, host: str) -> LineProcess:
         log = self._folder / f"{name}.output"
-        process = LineProcess(
-            module,
-            words,
-            log,
-            before=self._hosts.before(host),
-            environment=without_overrides(os.environ),  # what is tested is what the file says
-        )
-        self._all.append(process)
-        return process
+        return self.run(module, words, log, before=self._hosts.before(host))
 
     # ---------------------------------------------------------------- ends
-
-    def forget(self, process: LineProcess) -> None:
-        """Give back a process that has ended."""
-        process.end()
-        self._all.remove(process)
 
     def check(self) -> None:
         """Raise if a process ended by itself.
@@ -220,9 +201,3 @@ class TestedCell:
     def watcher_ended(self) -> bool:
         """Whether the watcher has ended."""
         return hasattr(self, "watcher") and self.watcher.status is not None
-
-    def close(self) -> None:
-        """End every process, however it is."""
-        for process in reversed(self._all):
-            process.end()
-        self._all.clear()

@@ -20,7 +20,15 @@ from enact_dist.patterns import pattern_matches
 from enact_dist.terms import Access
 from enact_dist.verify.chaos.journal import UNSEEN
 from enact_dist.verify.chaos.workload import MADE, VOLATILE
-from enact_dist.verify.checker import NOTHING, Anomaly, Checker, LockStory, Reading, State, Told
+from enact_dist.verify.checker import (
+    NOTHING,
+    Anomaly,
+    ChainState,
+    Checker,
+    LockOutcome,
+    LockStory,
+    StateRead,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -32,7 +40,7 @@ _FIRST: Final = 0
 """Epoch used for slots that keep their versions over restarts."""
 
 
-class History:
+class CheckedHistory:
     """The history of a run, ready for the checker.
 
     Attributes:
@@ -46,7 +54,7 @@ class History:
         self._restarts: dict[str, list[Restart]] = defaultdict(list)
         for restart in evidence.restarts:
             self._restarts[restart.shard].append(restart)
-        self.chains: dict[str, list[State]] = {}
+        self.chains: dict[str, list[ChainState]] = {}
         self.oddities: list[Anomaly] = []
         self.guessed: dict[str, None] = {}
         self._seen: dict[str, dict[tuple[int, int], dict[str, None]]] = defaultdict(dict)
@@ -67,7 +75,7 @@ class History:
     def checker(self) -> Checker:
         """Return the checker of this history."""
         stories = [self._story(record) for record in self._locks.values()]
-        stories += [LockStory(name, 0, None, Told.UNKNOWN) for name in self.guessed]
+        stories += [LockStory(name, 0, None, LockOutcome.UNKNOWN) for name in self.guessed]
         events = {
             _name_of(restart): (restart.down_ns, restart.ready_ns)
             for restarts in self._restarts.values()
@@ -162,7 +170,7 @@ class History:
 
     def _build(self, slot: str) -> None:
         """Tell a slot state by state."""
-        states: list[State] = []
+        states: list[ChainState] = []
         names = self._names[slot] = {}
         seen = self._seen[slot]
         found_at: dict[str, tuple[int, int]] = {}
@@ -175,7 +183,7 @@ class History:
             if restart is not None:
                 name = f"null {epoch} 0"
                 names[epoch, 0] = name
-                states.append(State(name, self._emptied_by(restart, slot), 0))
+                states.append(ChainState(name, self._emptied_by(restart, slot), 0))
             newest = max((version for since, version in seen if since == epoch), default=0)
             for version in range(1, newest + 1):
                 at = (epoch, version)
@@ -213,11 +221,11 @@ class History:
 
     def _states_at(
         self, slot: str, at: tuple[int, int], found_at: dict[str, tuple[int, int]]
-    ) -> list[State]:
+    ) -> list[ChainState]:
         """Return what stood under a version: one state, unless something is wrong."""
         version = at[1]
         writers = list(self._seen[slot].get(at, ()))
-        states = [State(writer, writer, version) for writer in writers if writer]
+        states = [ChainState(writer, writer, version) for writer in writers if writer]
         if "" in writers:
             states.append(self._claimed_state(slot, at, null=True, found_at=found_at))
         if not states and (self._may_be(slot, at, found_at) or _is_volatile(slot)):
@@ -231,9 +239,9 @@ class History:
         claims = [
             (record, writer)
             for record, writer in self._claims.get(slot, {}).get(at, ())
-            if record.told is not Told.NOT and found_at.get(record.id, at) == at
+            if record.told is not LockOutcome.NOT and found_at.get(record.id, at) == at
         ]
-        sure = [claim for claim in claims if claim[0].told is Told.COMMITTED]
+        sure = [claim for claim in claims if claim[0].told is LockOutcome.COMMITTED]
         return sure or claims
 
     def _claimed_state(
@@ -243,26 +251,26 @@ class History:
         *,
         null: bool,
         found_at: dict[str, tuple[int, int]],
-    ) -> State:
+    ) -> ChainState:
         claims = self._may_be(slot, at, found_at)
         if null:
             claims = [claim for claim in claims if not claim[1]]
         version = at[1]
         if len(claims) == 1:
             ((record, writer),) = claims
-            return State(writer or f"null {version}", record.id, version)
+            return ChainState(writer or f"null {version}", record.id, version)
         name = f"null {version}" if null else f"unseen {at[0]} {version}"
         if null and not claims:
-            return State(name, f"an unknown lock's {slot} {version}", version)
+            return ChainState(name, f"an unknown lock's {slot} {version}", version)
         guess = f"one of {[record.id for record, _ in claims]} at {slot} {version}"
         self.guessed[guess] = None
-        return State(name, guess, version)
+        return ChainState(name, guess, version)
 
     # ---------------------------------------------------------------- stories
 
     def _story(self, record: LockRecord) -> LockStory:
-        reads: list[Reading] = []
-        views: list[Reading] = []
+        reads: list[StateRead] = []
+        views: list[StateRead] = []
         for slot, version, writer, protected in record.seen:
             reading = self._reading(record, slot, version, writer, protected=protected)
             if reading is not None:
@@ -281,18 +289,18 @@ class History:
 
     def _reading(
         self, record: LockRecord, slot: str, version: int, writer: str, *, protected: bool
-    ) -> Reading | None:
+    ) -> StateRead | None:
         if writer not in ("", UNSEEN):
-            return Reading(slot, writer)
+            return StateRead(slot, writer)
         if _is_volatile(slot) and not protected:
             return None  # null in an unknown epoch
         at = (_epoch(record, slot), version)
         if version == 0:
-            return Reading(slot, self._names[slot].get(at, NOTHING))
+            return StateRead(slot, self._names[slot].get(at, NOTHING))
         name = self._names[slot].get(at)
-        return Reading(slot, name or f"unknown {version}")
+        return StateRead(slot, name or f"unknown {version}")
 
-    def _absent(self, record: LockRecord) -> list[Reading]:
+    def _absent(self, record: LockRecord) -> list[StateRead]:
         """Return what the patterns of a lock did not show, and so said to be null."""
         if record.granted_ns is None or (not record.seen and not record.tried):
             return []
@@ -301,7 +309,7 @@ class History:
         for access, context, pattern, aspect in record.items:
             if Access(access).each:
                 made = self._matching(f"{context}:", pattern, aspect)
-                absent += [Reading(slot, NOTHING) for slot in made if slot not in shown]
+                absent += [StateRead(slot, NOTHING) for slot in made if slot not in shown]
         return absent
 
     def _matching(self, context: str, pattern: str, aspect: str) -> list[str]:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from enact_dist import connect
 from enact_dist.errors import LinkError
 from enact_dist.verify.chaos.journal import Journal
-from enact_dist.verify.chaos.workload import Workload
+from enact_dist.verify.chaos.workload import LockWorkload
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -62,7 +62,7 @@ class ClientProcess:
             name = f"{self._name}.{self._connections}.{lane}"
             seed = hash((self._seed, self._connections, lane))
             try:
-                work = Workload(cell, self._journal, name, seed=seed, ttl_s=self._ttl_s)
+                work = LockWorkload(cell, self._journal, name, seed=seed, ttl_s=self._ttl_s)
                 while not self._stop.is_set() and not anew.is_set():
                     work.run_one()
                     if work.skewed:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 from enact_dist.errors import ConfigError
 from enact_dist.verify.chaos import watcher
 from enact_dist.verify.chaos.journal import SUFFIX, read_lines
-from enact_dist.verify.checker import Told
+from enact_dist.verify.checker import LockOutcome
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -48,7 +48,7 @@ class LockRecord:
     begun_ns: int
     granted_ns: int | None = None
     ended_ns: int | None = None
-    told: Told = Told.UNKNOWN
+    told: LockOutcome = LockOutcome.UNKNOWN
     why: str = "its process died"
     epochs: dict[str, int] = field(default_factory=dict)
     seen: list[tuple[str, int, str, bool]] = field(default_factory=list)
@@ -140,7 +140,7 @@ def _read_journal(path: Path, evidence: Evidence) -> None:
             record.writes = [(slot, version, by) for slot, version, by in rest[0]]
             record.expected, record.tried = rest[1], True
         elif word == "end":
-            record.ended_ns, record.told, record.why = rest[0], Told(rest[1]), rest[2]
+            record.ended_ns, record.told, record.why = rest[0], LockOutcome(rest[1]), rest[2]
         else:
             raise ValueError(f"{path.name}: a line begins with {word!r}")
 

@@ -33,7 +33,7 @@ from enact_dist.verify.chaos.network.switch import Cable
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from enact_dist.verify.chaos.cell import Client, TestedCell
+    from enact_dist.verify.chaos.cell import StartedClient, TestedCell
     from enact_dist.verify.chaos.journal import Journal
     from enact_dist.verify.chaos.network.hosts import Hosts
 
@@ -64,7 +64,7 @@ POLL_S: Final = 0.02
 AIM_S: Final = 0.3
 
 
-class Injector:
+class FaultInjector:
     """Draws faults and carries them out.
 
     Args:
@@ -172,7 +172,7 @@ class Injector:
         process, from_ns = self._cell.shards[name].process, time.monotonic_ns()
         self._cell.shards[name].ready.clear()
         process.kill()
-        self._cell.forget(process)
+        self._cell.end(process)
         pause_s = self._draw.choice((0.0, 0.0, 0.2, 1.0, 2.0)) * self._ttl_s
         self._after(pause_s, lambda: self._start_shard(name, KILL_SHARD, from_ns))
         return True
@@ -211,7 +211,7 @@ class Injector:
                     raise LinkError(f"shard {name} does not end {END_S:g} s after SIGTERM")
                 self._after(0.0, again)
                 return
-            self._cell.forget(shard.process)
+            self._cell.end(shard.process)
             self._start_shard(name, kind, from_ns, offset_s=offset_s)
 
         self._after(0.0, again)
@@ -226,11 +226,11 @@ class Injector:
         from_ns = time.monotonic_ns()
         client.process.kill()
         self._note(KILL_CLIENT, [f"{name}.{client.incarnation}"], from_ns)
-        self._cell.forget(client.process)
+        self._cell.end(client.process)
         self._cell.start_client(name, client.host, incarnation=client.incarnation + 1)
         return True
 
-    def _aim(self, client: Client) -> None:
+    def _aim(self, client: StartedClient) -> None:
         """Wait until the client is where it hurts: within a lock, or about to send a commit.
 
         Such moments are short and seldom hit by chance; without one within `AIM_S` any will do.

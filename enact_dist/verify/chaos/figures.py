@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.terms import Access
-from enact_dist.verify.chaos.chains import History
+from enact_dist.verify.chaos.chains import CheckedHistory
 from enact_dist.verify.chaos.faults import (
     KILL_CLIENT,
     LOSSY,
@@ -22,7 +22,7 @@ from enact_dist.verify.chaos.faults import (
     STOP_CLIENT,
 )
 from enact_dist.verify.chaos.workload import UNEXPECTED
-from enact_dist.verify.checker import Anomaly, Told
+from enact_dist.verify.checker import Anomaly, LockOutcome
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -100,14 +100,14 @@ class Verdict:
 
 def judge(evidence: Evidence) -> Verdict:
     """Check the history of a run and count what happened."""
-    history = History(evidence)
+    history = CheckedHistory(evidence)
     checker = history.checker()
     locks = evidence.locks.values()
     anomalies = [Anomaly(rule, (text,)) for rule, text in evidence.failures]
     unexpected = Counter(lock.why for lock in locks if lock.why.startswith(UNEXPECTED))
     anomalies += [Anomaly(f"{n} times {why}", ()) for why, n in unexpected.items()]
     anomalies += [*history.oddities, *checker.anomalies()]
-    committed = [lock for lock in locks if lock.told is Told.COMMITTED]
+    committed = [lock for lock in locks if lock.told is LockOutcome.COMMITTED]
     outcomes = Counter(lock.why or lock.told.value for lock in locks)
     return Verdict(
         settings=evidence.settings,

@@ -13,10 +13,10 @@ from enact_dist.errors import ConfigError, LinkError
 from enact_dist.verify.chaos import daemon
 from enact_dist.verify.chaos.cell import END_S, TestedCell
 from enact_dist.verify.chaos.evidence import FAULTS, SETTINGS
-from enact_dist.verify.chaos.faults import DECK, Injector
+from enact_dist.verify.chaos.faults import DECK, FaultInjector
 from enact_dist.verify.chaos.journal import Journal
 from enact_dist.verify.chaos.network.hosts import open_hosts
-from enact_dist.verify.checker import Told
+from enact_dist.verify.checker import LockOutcome
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -95,7 +95,7 @@ def run(settings: ChaosSettings, folder: Path, *, progress: Callable[[str, float
     try:
         progress("starting", settings.seconds)
         cell.start(shards, told["groups"], watcher_host=WATCHER_HOST)  # type: ignore[arg-type]
-        injector = Injector(
+        injector = FaultInjector(
             cell, hosts, groups, log, seed=settings.seed, ttl_s=TTL_S, deck=settings.deck
         )
         injector.run(settings.seconds, progress=lambda left_s: progress("faults", left_s))
@@ -118,7 +118,7 @@ def _rest(cell: TestedCell, log: Journal) -> None:
         client.process.expect("done", timeout_s=END_S)
     cell.watcher.tell("final")
     told = cell.watcher.expect("final", timeout_s=END_S)
-    if told != Told.COMMITTED.value:
+    if told != LockOutcome.COMMITTED.value:
         log.write("failure", "not everything can be read at the end", told)
     cell.watcher.tell(f"rest {REST_S}")
     left = int(cell.watcher.expect("left", timeout_s=END_S))

@@ -25,8 +25,8 @@ from typing import TYPE_CHECKING, Final
 from enact_dist import connect
 from enact_dist.core.protocol.messages import ListLocks, ListSessions, Locks, Sessions
 from enact_dist.verify.chaos.journal import SUFFIX, Journal
-from enact_dist.verify.chaos.workload import Workload
-from enact_dist.verify.checker import Told
+from enact_dist.verify.chaos.workload import LockWorkload
+from enact_dist.verify.checker import LockOutcome
 
 if TYPE_CHECKING:
     from enact_dist import Cell
@@ -47,7 +47,7 @@ class Watcher:
         self._folder, self._ttl_s, self._ahead_ns = folder, ttl_s, ahead_ns
         self._log = Journal(folder / LOG, ahead_ns=ahead_ns)
         self._doubts: dict[tuple[str, str], tuple[int, int]] = {}
-        self._final: Workload | None = None
+        self._final: LockWorkload | None = None
         self._looks = 0
         self.locks_left = 0
 
@@ -89,9 +89,9 @@ class Watcher:
         """
         if self._final is None:
             journal = Journal(self._folder / f"final{SUFFIX}", ahead_ns=self._ahead_ns)
-            self._final = Workload(self._cell, journal, "final", seed=0, ttl_s=self._ttl_s)
+            self._final = LockWorkload(self._cell, journal, "final", seed=0, ttl_s=self._ttl_s)
         again_s = time.monotonic() + FINAL_S
-        while (told := self._final.take_all()) is not Told.COMMITTED:
+        while (told := self._final.take_all()) is not LockOutcome.COMMITTED:
             if time.monotonic() > again_s:
                 break
             time.sleep(PERIOD_S)  # a failure that comes at once is not asked for again at once

@@ -36,7 +36,7 @@ from enact_dist.errors import (
     ShardUnreachableError,
 )
 from enact_dist.verify.chaos.journal import UNSEEN
-from enact_dist.verify.checker import Told
+from enact_dist.verify.checker import LockOutcome
 
 if TYPE_CHECKING:
     from enact_dist import Cell
@@ -74,7 +74,7 @@ class DiscardError(Exception):
 
 
 @dataclass(slots=True)
-class Plan:
+class PlannedLock:
     """One lock to be: its requests and what to do with it."""
 
     kind: str
@@ -91,7 +91,7 @@ class Plan:
     hold_s: float = 30.0
 
 
-class Workload:
+class LockWorkload:
     """One thread of locks.
 
     Args:
@@ -120,7 +120,7 @@ class Workload:
         name = aspect or draw.choices(("kept", "swift", "frame"), (4, 2, 2))[0]
         return world, Entity(f"thing/{shard}/{number}"), ASPECTS[name]
 
-    def plan(self) -> Plan:
+    def plan(self) -> PlannedLock:
         """Draw the next lock."""
         draw = self._draw
         kinds = {
@@ -145,7 +145,7 @@ class Workload:
             plan.hold_s = draw.choice((0.3, 30.0))
         return plan
 
-    def _requests(self, kind: str) -> Plan:
+    def _requests(self, kind: str) -> PlannedLock:
         draw, shards = self._draw, self._shards
         some = draw.sample(shards, draw.randint(min(2, len(shards)), len(shards)))
         things = {self._thing(shard): None for shard in some}
@@ -153,66 +153,66 @@ class Workload:
             write = Write(*self._thing(draw.choice(shards)))
             blind = draw.random() < 0.15 and write.aspect.name != VOLATILE
             delete = draw.random() < 0.05 and write.aspect.name != VOLATILE
-            return Plan(kind, [write], [write], blind=blind, delete=delete)
+            return PlannedLock(kind, [write], [write], blind=blind, delete=delete)
         if kind == "write over shards":
             writes = [Write(*thing) for thing in things]
-            return Plan(kind, list(writes), writes)
+            return PlannedLock(kind, list(writes), writes)
         if kind == "read":
-            return Plan(kind, [Read(*thing) for thing in things])
+            return PlannedLock(kind, [Read(*thing) for thing in things])
         if kind == "view":
             more = {self._thing(draw.choice(shards)): None for _ in range(2)}
-            return Plan(kind, [View(*thing) for thing in {**things, **more}])
+            return PlannedLock(kind, [View(*thing) for thing in {**things, **more}])
         if kind == "read and write":
             first, *others = things
             write = Write(*first)
-            return Plan(kind, [write, *(Read(*thing) for thing in others)], [write])
+            return PlannedLock(kind, [write, *(Read(*thing) for thing in others)], [write])
         if kind == "expect and write":
             first, *others = things
             write, views = Write(*first), [View(*thing) for thing in others]
             expect = [view for view in views if draw.random() < 0.7]
-            return Plan(kind, [write, *views], [write], expect=expect)
+            return PlannedLock(kind, [write, *views], [write], expect=expect)
         world = self._worlds["online"]
         generation = int(self._journal.now_ns() / 1e9 / GENERATION_S)
         pattern = Entities(f"made/{generation}/*")
         if kind == "look, then create":
             every = WriteEach(world, pattern, ASPECTS[MADE])
-            return Plan(kind, [every], each=every)
+            return PlannedLock(kind, [every], each=every)
         write = Write(*self._thing(draw.choice(shards)))
         all_of = ReadEach(world, pattern, ASPECTS[MADE])
-        return Plan(kind, [all_of, write], [write], each=all_of)
+        return PlannedLock(kind, [all_of, write], [write], each=all_of)
 
     # ---------------------------------------------------------------- one lock
 
-    def run_one(self) -> Told:
+    def run_one(self) -> LockOutcome:
         """Take one lock that is drawn; see `take`."""
         return self.take(self.plan())
 
-    def take(self, plan: Plan) -> Told:
+    def take(self, plan: PlannedLock) -> LockOutcome:
         """Take one lock, from asking to its end; its history is in the journal."""
         self._count += 1
         lock_id = f"{self._name}.{self._count}"
         journal = self._journal
         items = [[int(request.access), *request.address] for request in plan.requests]
         journal.write("begin", lock_id, journal.now_ns(), plan.kind, items)
-        told, why = Told.NOT, ""
+        told, why = LockOutcome.NOT, ""
         try:
             with Lock(*plan.requests, wait_s=plan.wait_s, hold_s=plan.hold_s) as lock:
                 journal.write("granted", lock_id, journal.now_ns(), lock.token)
                 self._block(lock, lock_id, plan)
-            told = Told.COMMITTED
+            told = LockOutcome.COMMITTED
         except DiscardError:
             why = "discarded"
         except CommitUnknownError:
-            told, why = Told.UNKNOWN, "CommitUnknownError"
+            told, why = LockOutcome.UNKNOWN, "CommitUnknownError"
         except NOT_WRITTEN as error:
             why = type(error).__name__
             self.skewed = isinstance(error, ClockSkewError)
         except EnactError as error:
-            told, why = Told.UNKNOWN, f"{UNEXPECTED}{type(error).__name__}: {error}"
+            told, why = LockOutcome.UNKNOWN, f"{UNEXPECTED}{type(error).__name__}: {error}"
         journal.write("end", lock_id, journal.now_ns(), told.value, why)
         return told
 
-    def take_all(self) -> Told:
+    def take_all(self) -> LockOutcome:
         """Read everything that any workload writes, under one lock."""
         things = [
             Read(world, Entity(f"thing/{shard}/{number}"), aspect)
@@ -223,9 +223,9 @@ class Workload:
             if aspect.name != MADE
         ]
         made = ReadEach(self._worlds["online"], Entities(f"{MADE}/**"), ASPECTS[MADE])
-        return self.take(Plan("read everything", [*things, made], wait_s=20.0))
+        return self.take(PlannedLock("read everything", [*things, made], wait_s=20.0))
 
-    def _block(self, lock: Lock, lock_id: str, plan: Plan) -> None:
+    def _block(self, lock: Lock, lock_id: str, plan: PlannedLock) -> None:
         seen = self._look(lock, plan)
         self._journal.write("seen", lock_id, seen)
         if plan.think_s:
@@ -241,7 +241,7 @@ class Workload:
         expected = [slot_name(view) for view in plan.expect]
         self._journal.write("write", lock_id, writes, expected)
 
-    def _look(self, lock: Lock, plan: Plan) -> list[tuple[str, int, str, bool]]:
+    def _look(self, lock: Lock, plan: PlannedLock) -> list[tuple[str, int, str, bool]]:
         """Read everything that was asked for; return it in the words of the journal."""
         seen = []
         for request in plan.requests:
@@ -261,7 +261,7 @@ class Workload:
         return seen
 
     def _write(
-        self, lock: Lock, lock_id: str, write: Write[str], plan: Plan, epochs: dict[str, int]
+        self, lock: Lock, lock_id: str, write: Write[str], plan: PlannedLock, epochs: dict[str, int]
     ) -> tuple[str, int, str]:
         version = lock.version(write) + 1
         if plan.delete:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.cli.text.output import print_json
 from enact_dist.cli.verbs import DONE, FAILED
-from enact_dist.verify.frames.lives import Broken, Tally, live
+from enact_dist.verify.frames.lives import BrokenLife, LifeTally, live
 from enact_dist.verify.simulation.series import fresh_seed
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ TOLD_S: Final = 5.0
 
 def run(arguments: argparse.Namespace) -> int:
     """Let shards live under hostile frames; status 1 if one broke a rule, 130 after Ctrl-C."""
-    tally, begin_s = Tally(), time.monotonic()
+    tally, begin_s = LifeTally(), time.monotonic()
     first = fresh_seed() if arguments.first is None else arguments.first
     seconds = SECONDS if arguments.seconds is None else arguments.seconds
     count = arguments.seeds
@@ -40,7 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
                 print(
                     f"{told_s - begin_s:.0f} s, {tally.frames} frames", file=sys.stderr, flush=True
                 )
-    except Broken as broken:
+    except BrokenLife as broken:
         problem = str(broken)
     except KeyboardInterrupt:
         interrupted = True
@@ -54,7 +54,9 @@ def run(arguments: argparse.Namespace) -> int:
     return 130 if interrupted else DONE
 
 
-def _as_json(tally: Tally, first: int, seed: int, problem: str, wall_s: float) -> dict[str, object]:
+def _as_json(
+    tally: LifeTally, first: int, seed: int, problem: str, wall_s: float
+) -> dict[str, object]:
     return {
         "first": first,
         "lives": tally.lives,
@@ -69,7 +71,7 @@ def _as_json(tally: Tally, first: int, seed: int, problem: str, wall_s: float) -
     }
 
 
-def _tell(tally: Tally, seed: int, problem: str, wall_s: float) -> None:
+def _tell(tally: LifeTally, seed: int, problem: str, wall_s: float) -> None:
     print(
         f"{tally.frames} legal frames of {len(tally.asked)} kinds in {wall_s:.0f} s, to"
         f" {tally.lives} shards ({tally.with_store} with a store), started again"

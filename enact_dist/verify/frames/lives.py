@@ -76,12 +76,12 @@ IDENTITIES: Final = (*[""] * 20, *SESSIONS, shard_identity("far"))
 """Most come from this process itself, which owns both sessions; the others own nothing."""
 
 
-class Broken(Exception):
+class BrokenLife(Exception):
     """A rule that was broken; its text says which, and by which frame."""
 
 
 @dataclass(slots=True)
-class Tally:
+class LifeTally:
     """What lives have shown.
 
     Attributes:
@@ -103,7 +103,7 @@ class Tally:
     answers: Counter[str] = field(default_factory=Counter)
 
 
-def live(seed: int, tally: Tally) -> None:
+def live(seed: int, tally: LifeTally) -> None:
     """Let one shard live under the frames of a seed.
 
     Raises:
@@ -122,7 +122,7 @@ def _greetings() -> list[Request]:
 class _Life:
     """What both kinds of lives share: frames go out and answers come back as on the wire."""
 
-    def __init__(self, seed: int, tally: Tally) -> None:
+    def __init__(self, seed: int, tally: LifeTally) -> None:
         self.random = random.Random(seed)
         self.hostile = Hostile(self.random)
         self.tally = tally
@@ -136,11 +136,11 @@ class _Life:
         """Live."""
         try:
             self.live()
-        except Broken:
+        except BrokenLife:
             raise
         except Exception as error:
             trace = traceback.format_exc()
-            raise Broken(f"{error!r} at {_shown(self.now)}\n{trace}") from error
+            raise BrokenLife(f"{error!r} at {_shown(self.now)}\n{trace}") from error
 
     def live(self) -> None:
         """Send the frames and judge what comes of them."""
@@ -170,13 +170,13 @@ class _Life:
         with self._mutex:
             asked = self.waits.pop(handle, None)
             if asked is None:
-                raise Broken(f"answered twice: {_shown(answer)}")
+                raise BrokenLife(f"answered twice: {_shown(answer)}")
             try:
                 header, payload = encode_frame(answer)
                 decode_frame(header, bytes(payload) if payload is not None else b"")
             except Exception as error:
                 said = f"{_shown(answer)} to {_shown(asked)}"
-                raise Broken(f"an answer cannot be sent ({error!r}): {said}") from error
+                raise BrokenLife(f"an answer cannot be sent ({error!r}): {said}") from error
             self.tally.answers[type(answer).__name__] += 1
             if isinstance(answer, Granted):
                 self.grants[answer.lock] = answer
@@ -185,7 +185,7 @@ class _Life:
         """Find requests that were never answered."""
         if self.waits:
             left = "; ".join(_shown(request) for request in list(self.waits.values())[:3])
-            raise Broken(f"{len(self.waits)} requests stayed unanswered: {left}")
+            raise BrokenLife(f"{len(self.waits)} requests stayed unanswered: {left}")
 
 
 class _CoreLife(_Life):
@@ -248,7 +248,7 @@ class _CoreLife(_Life):
             self._perform(effect)
         deadline_ns = self.shard.next_deadline_ns()
         if not isinstance(deadline_ns, int):
-            raise Broken(f"the next deadline is {deadline_ns!r}")
+            raise BrokenLife(f"the next deadline is {deadline_ns!r}")
 
     def _perform(self, effect: Effect) -> None:
         if isinstance(effect, Reply):
@@ -273,7 +273,7 @@ class _StoreLife(_Life):
 
     def live(self) -> None:
         self.tally.with_store += 1
-        self.broken: Broken | None = None
+        self.broken: BrokenLife | None = None
         memory = Path("/dev/shm")  # noqa: S108 - a folder of its own in there
         with ExitStack() as undo:
             place = memory if memory.is_dir() else None
@@ -294,13 +294,13 @@ class _StoreLife(_Life):
                 if arrived is not None:
                     self._submit(host, arrived, self.random.choice(IDENTITIES))
                 if host.failure is not None:
-                    raise Broken(f"the host failed: {host.failure!r} at {_shown(self.now)}")
+                    raise BrokenLife(f"the host failed: {host.failure!r} at {_shown(self.now)}")
                 if self.random.random() < 0.2:
                     host.event(Tick())
             host.drain()
             self._wait()
             if host.failure is not None:
-                raise Broken(f"the host failed: {host.failure!r}")
+                raise BrokenLife(f"the host failed: {host.failure!r}")
             host.close()
             open_host(SETTINGS, folder / "s0").close()
             self.tally.restarts += 1
@@ -311,7 +311,7 @@ class _StoreLife(_Life):
         def reply(answer: Answer) -> None:
             try:
                 self.answered(handle, answer)
-            except Broken as broken:  # in a thread of the host, perhaps
+            except BrokenLife as broken:  # in a thread of the host, perhaps
                 self.broken = self.broken or broken
 
         host.submit(request, reply, identity)  # type: ignore[attr-defined]

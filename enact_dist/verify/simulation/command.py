@@ -11,7 +11,7 @@ from enact_dist.cli.text.output import print_json, shown_s
 from enact_dist.cli.verbs import DONE, FAILED
 from enact_dist.errors import ConfigError
 from enact_dist.verify.simulation.scenario import Scenario
-from enact_dist.verify.simulation.schedule import WHOLE, Part, names_in
+from enact_dist.verify.simulation.schedule import WHOLE, PartOfRun, names_in
 from enact_dist.verify.simulation.series import Totals, fresh_seed, run_series
 from enact_dist.verify.simulation.shrink import Shrunk, command, shrink
 
@@ -75,7 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
     return INTERRUPTED if totals.interrupted else DONE
 
 
-def part_of(arguments: argparse.Namespace) -> Part:
+def part_of(arguments: argparse.Namespace) -> PartOfRun:
     """Return what of a run the options ask for.
 
     Raises:
@@ -89,7 +89,7 @@ def part_of(arguments: argparse.Namespace) -> Part:
             raise ConfigError(
                 f"--clients {arguments.clients}: clients are named by number, as in --clients 1,3"
             ) from None
-    return Part(
+    return PartOfRun(
         only=None if arguments.only is None else names_in(arguments.only),
         locks=None if arguments.locks is None else names_in(arguments.locks),
         clients=clients,
@@ -97,7 +97,7 @@ def part_of(arguments: argparse.Namespace) -> Part:
     )
 
 
-def _made_small(arguments: argparse.Namespace, result: Result, part: Part = WHOLE) -> Shrunk:
+def _made_small(arguments: argparse.Namespace, result: Result, part: PartOfRun = WHOLE) -> Shrunk:
     seconds = arguments.shrink_s if part == WHOLE else 0.0
     if seconds and not arguments.json:
         print(f"seed {result.seed} breaks a rule; shrinking it", file=sys.stderr, flush=True)
@@ -107,7 +107,7 @@ def _made_small(arguments: argparse.Namespace, result: Result, part: Part = WHOL
 # ---------------------------------------------------------------- one run
 
 
-def _run_one(arguments: argparse.Namespace, part: Part) -> int:
+def _run_one(arguments: argparse.Namespace, part: PartOfRun) -> int:
     scenario = Scenario(arguments.seed, part=part, story=not arguments.json)
     result = scenario.run()
     totals = Totals(arguments.seed)

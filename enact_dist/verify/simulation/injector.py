@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 from enact_dist.core.protocol.messages import Goodbye
 from enact_dist.core.protocol.records import Drain, SessionDied
-from enact_dist.verify.simulation.hosts.client_host import ClientHost
-from enact_dist.verify.simulation.hosts.shard_host import ShardHost
+from enact_dist.verify.simulation.hosts.client_host import ClientNode
+from enact_dist.verify.simulation.hosts.shard_host import ShardNode
 from enact_dist.verify.simulation.hosts.world import MS, Host, S
 
 if TYPE_CHECKING:
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.messages import Commit
     from enact_dist.verify.simulation.cells import CellPlan
     from enact_dist.verify.simulation.hosts.network import Network
-    from enact_dist.verify.simulation.hosts.world import World
-    from enact_dist.verify.simulation.schedule import Place
+    from enact_dist.verify.simulation.hosts.world import SimulatedWorld
+    from enact_dist.verify.simulation.schedule import FaultPlace
 
     Act = Callable[[Random], str]
 
@@ -35,19 +35,19 @@ class Injector:
 
     def __init__(
         self,
-        world: World,
+        world: SimulatedWorld,
         cell: CellPlan,
         network: Network,
-        shards: dict[str, ShardHost],
+        shards: dict[str, ShardNode],
         *,
         until_ns: int,
     ) -> None:
         self._world, self._cell, self._network, self._shards = world, cell, network, shards
         self._faults = cell.faults
         self._until_ns = until_ns
-        self.clients: dict[int, ClientHost] = {}
+        self.clients: dict[int, ClientNode] = {}
         """The process that is up for each client, by the client's number."""
-        self.token_of: Callable[[ClientHost], None] = lambda _client: None
+        self.token_of: Callable[[ClientNode], None] = lambda _client: None
         self.replace: Callable[[int], None] = lambda _number: None
         self.clock_set: Callable[[], None] = lambda: None
         self._decisions = world.schedule.place("decision")
@@ -93,10 +93,10 @@ class Injector:
         if text:
             self._world.befell(fault, text)
 
-    def _shard(self, luck: Random) -> ShardHost:
+    def _shard(self, luck: Random) -> ShardNode:
         return luck.choice(list(self._shards.values()))
 
-    def _client(self, luck: Random) -> ClientHost | None:
+    def _client(self, luck: Random) -> ClientNode | None:
         """Return who is up for a client; None if that client has no part in this run."""
         found = self.clients.get(luck.randint(1, self._cell.clients))
         return found if found is not None and found.up else None
@@ -104,7 +104,7 @@ class Injector:
     def _crash_one(self, luck: Random) -> str:
         return self._crash(self._shard(luck), luck)
 
-    def _crash(self, host: ShardHost, luck: Random) -> str:
+    def _crash(self, host: ShardNode, luck: Random) -> str:
         power_cut = luck.random() < self._faults.power_cut
         down_ns = luck.choice((20 * MS, 20 * MS, 300 * MS, 2 * S))
         # A link that breaks is often noticed at once, and then no client waits for an answer.
@@ -118,7 +118,7 @@ class Injector:
         how = "loses power" if power_cut else "is killed"
         return f"{host.name} {how}, back after {down_ns // MS} ms"
 
-    def _crash_later(self, fault: str, host: ShardHost, luck: Random, delay_ns: int) -> None:
+    def _crash_later(self, fault: str, host: ShardNode, luck: Random, delay_ns: int) -> None:
         """Crash a shard in a moment, as a part of a fault that has happened already."""
         self._world.after(delay_ns, lambda: self._fire(fault, partial(self._crash, host), luck))
 
@@ -133,7 +133,7 @@ class Injector:
         return f"{host.name} gets SIGTERM, ends after {delay_ns // MS} ms, back 300 ms later"
 
     @staticmethod
-    def _end_drained(host: ShardHost, life: int, luck: Random) -> None:
+    def _end_drained(host: ShardNode, life: int, luck: Random) -> None:
         if host.life == life:
             host.crash(power_cut=False, down_ns=300 * MS, luck=luck)
 
@@ -141,7 +141,7 @@ class Injector:
         client = self._client(luck)
         return "" if client is None else self._kill(client, luck)
 
-    def _kill(self, client: ClientHost, luck: Random) -> str:
+    def _kill(self, client: ClientNode, luck: Random) -> str:
         if not client.up:
             return ""
         leaves = luck.random() < 0.3
@@ -160,7 +160,7 @@ class Injector:
                 self._prove_death(client, host, delay_ns=luck.randrange(20 * MS))
         return f"{client.name} {'says goodbye and ends' if leaves else 'is killed'}"
 
-    def _prove_death(self, client: ClientHost, shard: ShardHost, *, delay_ns: int) -> None:
+    def _prove_death(self, client: ClientNode, shard: ShardNode, *, delay_ns: int) -> None:
         """Tell a shard what the kernel of its host knows; messages may still be under way."""
         self._world.tally["deaths proven"] += 1
         died = SessionDied(client.client.session)
@@ -183,7 +183,7 @@ class Injector:
         world.tally["pauses"] += 1
         world.tally["pauses longer than the TTL"] += duration_ns > ttl_ns
         pause_ns = min(duration_ns, max(0, self._until_ns - world.now_ns))
-        if isinstance(host, ClientHost):
+        if isinstance(host, ClientNode):
             host.pause(pause_ns)
             if busy:
                 world.tally["pauses with token"] += 1
@@ -195,7 +195,7 @@ class Injector:
         clock = ", and so does its clock" if suspended else ""
         return f"{host.name} stands still for {duration_ns // MS} ms{clock}"
 
-    def _token_goes(self, client: ClientHost, duration_ns: int) -> None:
+    def _token_goes(self, client: ClientNode, duration_ns: int) -> None:
         """Let a client's liveliness token vanish, a while after its link went silent."""
         self._world.after(self._cell.ttl_ns // 2, partial(self.token_of, client))
         self._world.after(duration_ns + 10 * MS, partial(self.token_of, client))
@@ -203,7 +203,7 @@ class Injector:
     def _stall_one(self, luck: Random) -> str:
         return self._stall(self._shard(luck), luck)
 
-    def _stall(self, host: ShardHost, luck: Random) -> str:
+    def _stall(self, host: ShardNode, luck: Random) -> str:
         ttl_ns = self._cell.ttl_ns
         duration_ns = luck.choice((ttl_ns // 8, ttl_ns // 2, ttl_ns, 3 * ttl_ns))
         if not host.stall(min(duration_ns, max(0, self._until_ns - self._world.now_ns))):
@@ -263,7 +263,7 @@ class Injector:
         world.tally["faults set off"] += 1
         kind, host = luck.choice(SET_OFF), luck.choice((source, target))
         late_ns = luck.choice((50 * MS, ttl_ns // 2, ttl_ns * 3 // 4, ttl_ns))
-        shard = next(h for h in (source, target) if isinstance(h, ShardHost))
+        shard = next(h for h in (source, target) if isinstance(h, ShardNode))
         told = [f"a message from {source.name} to {target.name}"]
         if kind == "lose":
             told.append("is lost")
@@ -271,7 +271,7 @@ class Injector:
             told.append(self._pause(host, luck))
         elif kind == "stall":
             told.append(self._stall(shard, luck))
-        elif kind == "kill" and isinstance(host, ClientHost):
+        elif kind == "kill" and isinstance(host, ClientNode):
             told.append(self._kill(host, luck))
         elif kind == "cut":
             duration_ns = luck.choice((300 * MS, ttl_ns))
@@ -285,7 +285,7 @@ class Injector:
             self._crash_later(fault, shard, luck, delay_ns)
         return None if kind == "lose" else late_ns * ("late" in kind)
 
-    def on_persist(self, place: Place, host: ShardHost) -> None:
+    def on_persist(self, place: FaultPlace, host: ShardNode) -> None:
         """Let a shard die while it writes."""
         bits = place.next()
         if (bits & 0xFFFF) < self._faults.triggered * 0x8000:
@@ -295,11 +295,11 @@ class Injector:
         """All are prepared, and the commit that decides is about to leave its client."""
         self._at_decision(self._decisions, [primary.name, *commit.participants], "before")
 
-    def on_decision(self, primary: ShardHost, told: Sequence[str]) -> None:
+    def on_decision(self, primary: ShardNode, told: Sequence[str]) -> None:
         """A decision is durable and its participants are about to be notified."""
         self._at_decision(self._told, [primary.name, *told], "after")
 
-    def _at_decision(self, place: Place, names: list[str], when: str) -> None:
+    def _at_decision(self, place: FaultPlace, names: list[str], when: str) -> None:
         bits = place.next()
         if (bits & 0xFFFF) < self._faults.at_decision * 0x10000 and not self._over:
             hosts = [self._shards[name] for name in names]
@@ -307,7 +307,7 @@ class Injector:
                 self._world.tally[f"crashes {when} a decision"] += 1
 
     def _crash_around(
-        self, fault: str, luck: Random, hosts: list[ShardHost], *, within_ns: int
+        self, fault: str, luck: Random, hosts: list[ShardNode], *, within_ns: int
     ) -> bool:
         """Let one of these shards die in a moment, or all of them."""
         if not self._world.schedule.allows(fault):

@@ -18,16 +18,16 @@ from enact_dist.core.shard.state import ShardSettings
 from enact_dist.verify.simulation import cells
 from enact_dist.verify.simulation import faults as fault_options
 from enact_dist.verify.simulation.cells import CONTEXTS, WORK_NS
-from enact_dist.verify.simulation.hosts.client_host import ClientHost
+from enact_dist.verify.simulation.hosts.client_host import ClientNode
 from enact_dist.verify.simulation.hosts.network import Network
 from enact_dist.verify.simulation.hosts.payloads import DRAFT_NS
-from enact_dist.verify.simulation.hosts.shard_host import ShardHost
-from enact_dist.verify.simulation.hosts.world import MS, S, SimulationError, World
+from enact_dist.verify.simulation.hosts.shard_host import ShardNode
+from enact_dist.verify.simulation.hosts.world import MS, S, SimulatedWorld, SimulationError
 from enact_dist.verify.simulation.injector import Injector
-from enact_dist.verify.simulation.judges.graph import Graph
-from enact_dist.verify.simulation.judges.history import History
+from enact_dist.verify.simulation.judges.graph import DependencyGraph
+from enact_dist.verify.simulation.judges.history import RunHistory
 from enact_dist.verify.simulation.judges.model import Model
-from enact_dist.verify.simulation.schedule import WHOLE, Happening, Part, Schedule
+from enact_dist.verify.simulation.schedule import WHOLE, Happening, PartOfRun, Schedule
 from enact_dist.verify.simulation.work.forks import Forker
 from enact_dist.verify.simulation.work.historian import Historian
 from enact_dist.verify.simulation.work.workload import ASPECTS, Workload
@@ -76,7 +76,7 @@ class Scenario:
         self,
         seed: int,
         *,
-        part: Part = WHOLE,
+        part: PartOfRun = WHOLE,
         faults: Faults | None = None,
         through_wire: bool = True,
         asserts: bool = True,
@@ -84,12 +84,12 @@ class Scenario:
     ) -> None:
         self.seed = seed
         self.schedule = Schedule(seed, part)
-        self.world = world = World(self.schedule, story=[] if story else None)
+        self.world = world = SimulatedWorld(self.schedule, story=[] if story else None)
         self.cell = cell = cells.drawn(self.schedule.stream("cell"), faults=faults)
         until_ns = WORK_NS if part.until_s is None else int(part.until_s * 1e9)
         self._faults_end_ns = min(cells.FAULTS_NS, until_ns + S // 2)
         self._work_ns = min(cell.work_ns, until_ns)
-        self.history = History()
+        self.history = RunHistory()
         self.model = Model(world, self.history, ASPECTS)
         self.network = Network(world, cell.faults, through_wire=through_wire)
         self.shards = self._made_shards(cell.shards)
@@ -105,14 +105,14 @@ class Scenario:
         self.injector.replace = self._add_client
         self.injector.clock_set = self.model.clock_was_set
 
-    def _made_shards(self, count: int) -> dict[str, ShardHost]:
+    def _made_shards(self, count: int) -> dict[str, ShardNode]:
         names = [f"s{index}" for index in range(count)]
         placement = PlacementMap(1, tuple(ShardEntry(name, ()) for name in names), ())
-        shards: dict[str, ShardHost] = {}
+        shards: dict[str, ShardNode] = {}
         for name in names:
             settings = ShardSettings(name, placement, worlds=CONTEXTS)
             offset_ns = self.schedule.stream(f"wall of {name}").randrange(-200 * MS, 200 * MS)
-            host = shards[name] = ShardHost(
+            host = shards[name] = ShardNode(
                 self.world, settings, self.cell.faults, wall_offset_ns=offset_ns
             )
             host.judge = self.model
@@ -124,7 +124,7 @@ class Scenario:
         """Start a process for a client, in the place of the one that was killed."""
         before = self.injector.clients.get(number)
         name = f"c{number}" if before is None else f"c{number}_{before.generation + 1}"
-        host = ClientHost(
+        host = ClientNode(
             self.world,
             name,
             network=self.network,
@@ -192,7 +192,7 @@ class Scenario:
             host.payloads.check_released()
             host.close()
         self.model.check_all_or_nothing()
-        graph = Graph(self.history, self.model)
+        graph = DependencyGraph(self.history, self.model)
         graph.check_views()
         cycle = graph.cycle()
         if cycle is not None:
@@ -250,7 +250,7 @@ class Scenario:
 
     # ---------------------------------------------------------------- liveliness tokens
 
-    def _visible(self, host: ClientHost, shard: ShardHost) -> bool:
+    def _visible(self, host: ClientNode, shard: ShardNode) -> bool:
         return (
             self.cell.faults.tokens
             and host.up
@@ -258,10 +258,10 @@ class Scenario:
             and not self.network.is_cut(host, shard)
         )
 
-    def _tokens_seen(self, shard: ShardHost) -> list[str]:
+    def _tokens_seen(self, shard: ShardNode) -> list[str]:
         return [h.client.session for h in self.model.of_clients.clients if self._visible(h, shard)]
 
-    def _token_of(self, host: ClientHost) -> None:
+    def _token_of(self, host: ClientNode) -> None:
         """Let every shard notice whether the client's liveliness token is there."""
         if not host.up:
             self._show_token(host, present=False)
@@ -270,7 +270,7 @@ class Scenario:
             seen = SessionSeen(host.client.session, self._visible(host, shard))
             shard.receive(partial(shard.event, seen))
 
-    def _show_token(self, host: ClientHost, *, present: bool) -> None:
+    def _show_token(self, host: ClientNode, *, present: bool) -> None:
         seen = SessionSeen(host.client.session, present and self.cell.faults.tokens)
         for shard in self.shards.values():
             self.world.after(10 * MS, partial(shard.receive, partial(shard.event, seen)))

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class PartOfRun:
     """What of a run takes place; None stands for all of it.
 
     Attributes:
@@ -47,7 +47,7 @@ NO_NAME = "none"
 
 
 def names_in(text: str) -> frozenset[str]:
-    """Read a list of names as `Part.options` writes it."""
+    """Read a list of names as `PartOfRun.options` writes it."""
     return frozenset() if text == NO_NAME else frozenset(text.split(","))
 
 
@@ -56,7 +56,7 @@ def _in_order(name: str | int) -> tuple[str, int]:
     return place, int(number)
 
 
-WHOLE = Part()
+WHOLE = PartOfRun()
 
 
 class Happening(NamedTuple):
@@ -71,7 +71,7 @@ class Happening(NamedTuple):
         return f"{self.at_ns / 1e9:10.6f} s  {self.name:14}  {self.text}"
 
 
-class Place:
+class FaultPlace:
     """Where faults may take place one after the other, each with luck of its own."""
 
     __slots__ = ("_draw", "name", "newest_delivered", "number")
@@ -98,16 +98,16 @@ class Schedule:
     """Which faults may take place in a run, and which did."""
 
     seed: int
-    part: Part = WHOLE
+    part: PartOfRun = WHOLE
     happened: dict[str, Happening] = field(default_factory=dict)
     locks: list[str] = field(default_factory=list)
-    _places: dict[str, Place] = field(default_factory=dict)
+    _places: dict[str, FaultPlace] = field(default_factory=dict)
 
-    def place(self, name: str) -> Place:
+    def place(self, name: str) -> FaultPlace:
         """Return the place of that name."""
         found = self._places.get(name)
         if found is None:
-            found = self._places[name] = Place(self.seed, name)
+            found = self._places[name] = FaultPlace(self.seed, name)
         return found
 
     def stream(self, name: str) -> Random:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from enact_dist.verify.simulation.scenario import Scenario
-from enact_dist.verify.simulation.schedule import WHOLE, Part
+from enact_dist.verify.simulation.schedule import WHOLE, PartOfRun
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -34,7 +34,7 @@ class Shrunk:
         runs: How many runs it took.
     """
 
-    part: Part
+    part: PartOfRun
     result: Result
     whole: Result
     runs: int
@@ -59,18 +59,18 @@ class Shrunk:
         ]
 
 
-def command(seed: int, part: Part = WHOLE) -> str:
+def command(seed: int, part: PartOfRun = WHOLE) -> str:
     """Return the command line that runs a seed again."""
     return " ".join(["enact verify --seed", str(seed), *part.options()])
 
 
-def run_part(seed: int, part: Part) -> Result:
+def run_part(seed: int, part: PartOfRun) -> Result:
     """Run a part of a seed's run."""
     return Scenario(seed, part=part).run()
 
 
 def shrink(
-    whole: Result, *, seconds: float, run: Callable[[int, Part], Result] = run_part
+    whole: Result, *, seconds: float, run: Callable[[int, PartOfRun], Result] = run_part
 ) -> Shrunk:
     """Look for a small part of a run that still breaks its rule.
 
@@ -85,7 +85,9 @@ def shrink(
 
 
 class _Shrinker:
-    def __init__(self, whole: Result, seconds: float, run: Callable[[int, Part], Result]) -> None:
+    def __init__(
+        self, whole: Result, seconds: float, run: Callable[[int, PartOfRun], Result]
+    ) -> None:
         self.best, self.part, self.runs = whole, WHOLE, 0
         self._rule = whole.rule
         self._run = run
@@ -95,7 +97,7 @@ class _Shrinker:
     def _over(self) -> bool:
         return self.runs >= RUNS_MAX or time.monotonic() >= self._end_s
 
-    def _breaks(self, part: Part) -> bool:
+    def _breaks(self, part: PartOfRun) -> bool:
         """Whether a part still breaks the rule; if so it is the best so far."""
         if self._over:
             return False

@@ -26,6 +26,12 @@ def above(x_m, y_m, z_m, *, yaw_rad=np.pi):
     return pose
 
 
+def on_belt(x_m=0.40, y_m=0.62, yaw_rad=0.0):
+    pose = on_tray(x_m, y_m, yaw_rad)
+    pose[2, 3] = TABLE_M
+    return pose
+
+
 def joints_for(pose, start_rad=HOME_RAD):
     """Return the joints that bring the tool to a pose, by damped least squares."""
     q = np.array(start_rad)

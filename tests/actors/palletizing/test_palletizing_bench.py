@@ -8,7 +8,7 @@ from actors.palletizing import packing_scores, perception_scores
 from actors.palletizing.packing_records import Judgement, Packed
 from actors.palletizing.perception_scores import Scored
 from enact_dist.bench.cases.palletizing import run_palletizing
-from enact_dist.bench.run import Asked
+from enact_dist.bench.run import PackingOptions
 from enact_dist.errors import MisuseError
 
 pytest.importorskip("mujoco", exc_type=ImportError)
@@ -23,7 +23,7 @@ def rows_of(asked):
 
 
 def test_packing_gives_a_row_per_score_and_per_cell_of_the_table(monkeypatch, tmp_path):
-    asked = Asked(60, 7, 1, provoke=("moved",), out=tmp_path / "scores")
+    asked = PackingOptions(60, 7, 1, provoke=("moved",), out=tmp_path / "scores")
     played = []
 
     def play(trays, **options):
@@ -48,8 +48,8 @@ def test_packing_gives_a_row_per_score_and_per_cell_of_the_table(monkeypatch, tm
 @pytest.mark.parametrize(
     ("asked", "why"),
     [
-        (Asked(36, provoke=("moved",)), "with 36 packages; .* needs 37 packages or more"),
-        (Asked(perception=True, provoke=("moved",)), "about packing"),
+        (PackingOptions(36, provoke=("moved",)), "with 36 packages; .* needs 37 packages or more"),
+        (PackingOptions(perception=True, provoke=("moved",)), "about packing"),
     ],
 )
 def test_options_that_would_do_nothing_are_refused(asked, why):
@@ -77,7 +77,7 @@ def test_perception_alone_gives_rows_for_each_series(monkeypatch):
     monkeypatch.setattr(
         perception_scores, "played", lambda *_, **__: iter([(series, [*sound, missed])])
     )
-    rows = rows_of(Asked(8, 1, perception=True))
+    rows = rows_of(PackingOptions(8, 1, perception=True))
     name = f"{series.name}, seed {series.seed}"
     assert rows[f"{name}: right"].value == pytest.approx(800 / 9)
     assert rows[f"{name}: right"].met is False

@@ -1,7 +1,8 @@
 """The process around one real `Client`: its calls, its keep-alives and its threads.
 
-A thread is a generator that yields what it waits for: `Sleep`, or `Calls` whose answers it is then
-sent, None for each that no shard answered in time.  It drives `MultiLock` as `link.client` does.
+A thread is a generator that yields what it waits for: `Sleep`, or `ParallelCalls` whose answers it
+is then sent, None for each that no shard answered in time.  It drives `MultiLock` as `link.client`
+does.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.datum import Datum, Slot
     from enact_dist.verify.simulation.faults import Faults
     from enact_dist.verify.simulation.hosts.network import Network
-    from enact_dist.verify.simulation.hosts.shard_host import ShardHost
-    from enact_dist.verify.simulation.hosts.world import World
+    from enact_dist.verify.simulation.hosts.shard_host import ShardNode
+    from enact_dist.verify.simulation.hosts.world import SimulatedWorld
 
 CALL_NS = S
 """How long a call may stay unanswered before its thread takes that for an answer."""
@@ -48,7 +49,7 @@ class Sleep:
 
 
 @dataclass(frozen=True, slots=True)
-class Calls:
+class ParallelCalls:
     """Make these calls at once and wait for all answers."""
 
     calls: Sequence[tuple[str, Request]]
@@ -56,7 +57,7 @@ class Calls:
 
 
 T = TypeVar("T")
-Steps: TypeAlias = Generator[Sleep | Calls, list[Answer | None], T]
+Steps: TypeAlias = Generator[Sleep | ParallelCalls, list[Answer | None], T]
 """A part of what a thread does, with what comes of it."""
 Thread: TypeAlias = Steps[None]
 
@@ -69,17 +70,17 @@ class _Call:
     lock: MultiLock | None
 
 
-class ClientHost(Host):
+class ClientNode(Host):
     """A client process with one session and several threads."""
 
     def __init__(
         self,
-        world: World,
+        world: SimulatedWorld,
         name: str,
         *,
         network: Network,
-        shards: dict[str, ShardHost],
-        check_beliefs: Callable[[ClientHost], None],
+        shards: dict[str, ShardNode],
+        check_beliefs: Callable[[ClientNode], None],
         faults: Faults,
         ttl_ns: int,
     ) -> None:
@@ -117,7 +118,7 @@ class ClientHost(Host):
         else:
             self._call_all(thread, wish)
 
-    def _call_all(self, thread: Thread, wish: Calls) -> None:
+    def _call_all(self, thread: Thread, wish: ParallelCalls) -> None:
         answers: list[Answer | None] = [None] * len(wish.calls)
         left = [len(wish.calls)]
 
@@ -208,7 +209,7 @@ class ClientHost(Host):
                 if not self.client.needs_hello(shard):
                     request = Register(self.client.session, (), aspects)
                 epoch = self.client.epoch(shard)
-                (answer,) = yield Calls([(shard, request)])
+                (answer,) = yield ParallelCalls([(shard, request)])
                 if answer is None:
                     yield Sleep(50 * MS)
                     continue
@@ -256,7 +257,7 @@ class ClientHost(Host):
             if not calls:
                 yield Sleep(max(MS, wait_until_ns - self.local_ns))
                 continue
-            answers = yield Calls(calls, lock)
+            answers = yield ParallelCalls(calls, lock)
             for (shard, request), answer in zip(calls, answers, strict=True):
                 if answer is not None:
                     self.learn(shard, answer)

@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 
     from enact_dist.core.protocol.records import Persist, Recovered
     from enact_dist.verify.simulation.faults import Faults
-    from enact_dist.verify.simulation.hosts.world import Host, World
+    from enact_dist.verify.simulation.hosts.world import Host, SimulatedWorld
 
 
 class Disk:
     """Everything that one shard ever asked to keep, as far as it has survived."""
 
-    def __init__(self, world: World, faults: Faults, name: str) -> None:
+    def __init__(self, world: SimulatedWorld, faults: Faults, name: str) -> None:
         self._world = world
         self.faults = faults
         self._batches = world.schedule.place(f"{name}-disk")

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from enact_dist.verify.simulation.faults import Faults
-    from enact_dist.verify.simulation.hosts.world import Host, World
-    from enact_dist.verify.simulation.schedule import Place
+    from enact_dist.verify.simulation.hosts.world import Host, SimulatedWorld
+    from enact_dist.verify.simulation.schedule import FaultPlace
 
 from enact_dist.verify.simulation.hosts.world import MS
 
@@ -58,11 +58,11 @@ class SetOff(Protocol):
 class Network:
     """Moves messages between hosts, badly."""
 
-    def __init__(self, world: World, faults: Faults, *, through_wire: bool) -> None:
+    def __init__(self, world: SimulatedWorld, faults: Faults, *, through_wire: bool) -> None:
         self._world = world
         self._through_wire = through_wire
         self._cuts: dict[tuple[str, str], int] = {}
-        self._links: dict[tuple[str, str], Place] = {}
+        self._links: dict[tuple[str, str], FaultPlace] = {}
         self.set_off: SetOff = lambda _fault, _luck, _source, _target: 0
         self.before_decision: Callable[[m.Commit, Host], None] = lambda _commit, _target: None
         self._set(faults)
@@ -117,7 +117,7 @@ class Network:
             world.after(delay_ns, delivery)
 
     def _befalls(
-        self, message: m.Message, link: Place, source: Host, target: Host, luck: int
+        self, message: m.Message, link: FaultPlace, source: Host, target: Host, luck: int
     ) -> list[int]:
         """Return how late each copy of a message is that arrives at all."""
         triggered, lost, doubled, late = (
@@ -151,7 +151,7 @@ class Network:
 
     def _deliver(
         self,
-        link: Place,
+        link: FaultPlace,
         number: int,
         target: Host,
         take: Callable[[SomeMessage], None],

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from enact_dist.core.shard.state import ShardSettings
     from enact_dist.verify.simulation.faults import Faults
     from enact_dist.verify.simulation.hosts.network import Network
-    from enact_dist.verify.simulation.hosts.world import World
+    from enact_dist.verify.simulation.hosts.world import SimulatedWorld
 
 
 ASSERT_EVERY = 4
@@ -38,24 +38,24 @@ ASSERT_EVERY = 4
 class ShardJudge(Protocol):
     """Looks at each step of a shard, and at its crashes and starts."""
 
-    def booted(self, host: ShardHost, recovered: Recovered, *, crashed_at_ns: int) -> None:
+    def booted(self, host: ShardNode, recovered: Recovered, *, crashed_at_ns: int) -> None:
         """A shard has started with what its disk kept."""
 
-    def judge_prefixes(self, host: ShardHost, *, power_cut: bool) -> None:
+    def judge_prefixes(self, host: ShardNode, *, power_cut: bool) -> None:
         """A shard is about to lose what a crash may take."""
 
-    def crashed(self, host: ShardHost, lost: list[Persist], *, power_cut: bool) -> None:
+    def crashed(self, host: ShardNode, lost: list[Persist], *, power_cut: bool) -> None:
         """A shard has died, and its disk has lost these records."""
 
-    def handled(self, host: ShardHost, message: object, effects: Sequence[Effect]) -> None:
+    def handled(self, host: ShardNode, message: object, effects: Sequence[Effect]) -> None:
         """A shard has taken a message and decided."""
 
 
-class ShardHost(Host):
+class ShardNode(Host):
     """A shard daemon.  `asked` are the requests that it has not answered yet, by their handles."""
 
     def __init__(
-        self, world: World, settings: ShardSettings, faults: Faults, *, wall_offset_ns: int
+        self, world: SimulatedWorld, settings: ShardSettings, faults: Faults, *, wall_offset_ns: int
     ) -> None:
         super().__init__(
             world, settings.name, drift_ppm=faults.drift_ppm, wall_offset_ns=wall_offset_ns
@@ -67,11 +67,11 @@ class ShardHost(Host):
         self.judge: ShardJudge
         self.shard: Shard
         self.payloads: ShardPayloads
-        self.tokens: Callable[[ShardHost], list[str]] = lambda _host: []
-        self.on_persist: Callable[[ShardHost], None] = lambda _host: None
-        self.on_decision: Callable[[ShardHost, list[str]], None] = lambda _host, _told: None
+        self.tokens: Callable[[ShardNode], list[str]] = lambda _host: []
+        self.on_persist: Callable[[ShardNode], None] = lambda _host: None
+        self.on_decision: Callable[[ShardNode, list[str]], None] = lambda _host, _told: None
         self.network: Network
-        self.peers: dict[str, ShardHost] = {}
+        self.peers: dict[str, ShardNode] = {}
         self.asked: dict[int, Request] = {}
         self._replies: dict[int, Callable[[Answer], None]] = {}
         self._handle = self._steps = 0

@@ -28,7 +28,7 @@ class SimulationError(Exception):
 
 
 @dataclass(slots=True)
-class Clock:
+class DriftingClock:
     """A clock that counts ns since some start, at a rate off by `ppm` millionths."""
 
     offset_ns: int
@@ -44,7 +44,7 @@ class Clock:
 
 
 @dataclass(slots=True)
-class World:
+class SimulatedWorld:
     """The queue of events, the schedule of faults and the tallies of one run.
 
     Attributes:
@@ -92,7 +92,9 @@ class World:
 class Host:
     """A process: its clocks, whether it is up, and what waits while it stands still."""
 
-    def __init__(self, world: World, name: str, *, drift_ppm: int, wall_offset_ns: int) -> None:
+    def __init__(
+        self, world: SimulatedWorld, name: str, *, drift_ppm: int, wall_offset_ns: int
+    ) -> None:
         self.world, self.name = world, name
         self._drift_ppm = drift_ppm
         self.life = 0
@@ -103,13 +105,13 @@ class Host:
         self._stood_at_ns = 0
         self._backlog: list[tuple[int, Callable[[], None]]] = []
 
-    def new_clock(self) -> Clock:
+    def new_clock(self) -> DriftingClock:
         """Return a clock with a start and a rate of its own."""
         random = self.world.schedule.stream(f"clock of {self.name} in life {self.life}")
         ppm = random.randint(-self._drift_ppm, self._drift_ppm)
         # It showed `offset` at this moment, wherever true time stands.
         now_ns = self.world.now_ns
-        return Clock(random.randrange(10**15) - now_ns * ppm // 1_000_000, ppm)
+        return DriftingClock(random.randrange(10**15) - now_ns * ppm // 1_000_000, ppm)
 
     @property
     def local_ns(self) -> int:

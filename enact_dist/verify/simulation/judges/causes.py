@@ -14,10 +14,10 @@ if TYPE_CHECKING:
 
     from enact_dist.core.protocol.messages import Notice
     from enact_dist.core.protocol.records import Content
-    from enact_dist.verify.simulation.hosts.shard_host import ShardHost
-    from enact_dist.verify.simulation.hosts.world import World
-    from enact_dist.verify.simulation.judges.history import Entry, History
-    from enact_dist.verify.simulation.judges.picture import Picture
+    from enact_dist.verify.simulation.hosts.shard_host import ShardNode
+    from enact_dist.verify.simulation.hosts.world import SimulatedWorld
+    from enact_dist.verify.simulation.judges.history import Entry, RunHistory
+    from enact_dist.verify.simulation.judges.picture import ShardPicture
 
 DRIFT: Final = 1.02
 """How much faster than true time a shard's clock may run."""
@@ -33,11 +33,11 @@ def reads_of(entry: Entry) -> tuple[DatumRead, ...]:
 class CauseJudge:
     """Looks at the causes of versions when they become visible, and after restarts."""
 
-    def __init__(self, world: World, history: History) -> None:
+    def __init__(self, world: SimulatedWorld, history: RunHistory) -> None:
         self._world, self._history = world, history
         self._known: dict[tuple[Slot, int, int], Cause] = {}
 
-    def applied(self, host: ShardHost, lock: LockId, notice: Notice) -> None:
+    def applied(self, host: ShardNode, lock: LockId, notice: Notice) -> None:
         """A commit became visible: does each of its versions say why?"""
         versions = [SlotVersion(change.slot, change.version) for change in notice.changes]
         for slot, _ in versions:
@@ -63,7 +63,7 @@ class CauseJudge:
         self._world.tally["causes that name reads"] += bool(cause.reads)
         self._known[slot, content.version, content.stamp_ns] = cause
 
-    def booted(self, host: ShardHost, picture: Picture) -> None:
+    def booted(self, host: ShardNode, picture: ShardPicture) -> None:
         """A shard started: is the cause of each version that it has kept what it was?"""
         for slot in picture.chains:
             content = host.shard.state.slots[slot]

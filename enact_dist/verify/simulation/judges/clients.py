@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from enact_dist.core.client.plan import Reading
     from enact_dist.core.protocol.datum import Datum, Slot
     from enact_dist.core.protocol.messages import Surveyed
-    from enact_dist.verify.simulation.hosts.client_host import ClientHost
+    from enact_dist.verify.simulation.hosts.client_host import ClientNode
     from enact_dist.verify.simulation.judges.growth import GrowthJudge
     from enact_dist.verify.simulation.judges.history import Observations
 
@@ -29,14 +29,14 @@ class ClientJudge:
         self._observed, self._growth = observed, growth
         self._world, self._history = observed.world, observed.history
         self._fail = observed.fail
-        self.clients: list[ClientHost] = []
+        self.clients: list[ClientNode] = []
 
-    def holds(self, host: ClientHost, entry: Entry) -> None:
+    def holds(self, host: ClientNode, entry: Entry) -> None:
         """A thread has its lock."""
         self._world.tally["locks held"] += 1
         self.check_beliefs(host)
 
-    def check_beliefs(self, host: ClientHost) -> None:
+    def check_beliefs(self, host: ClientNode) -> None:
         """I7: a client that believes in a lock now is alone with it."""
         entries = self._history.entries
         mine = _believed(host)
@@ -67,7 +67,7 @@ class ClientJudge:
         if (state.version, state.stamp_ns) != (0, 0) or datum is not None:
             self._fail("what is read was committed", reading)
 
-    def surveyed(self, host: ClientHost, own: Own, shard: str, answer: Surveyed) -> None:
+    def surveyed(self, host: ClientNode, own: Own, shard: str, answer: Surveyed) -> None:
         """A process lists versions at a shard that has settled: its own commits are among them.
 
         Args:
@@ -96,7 +96,7 @@ class ClientJudge:
                 if state.stamp_ns < stamp_ns:
                     self._fail("a process sees its own commits", entry.id, state, stamp_ns)
 
-    def told(self, host: ClientHost, entry: Entry) -> None:
+    def told(self, host: ClientNode, entry: Entry) -> None:
         """Check the outcome of a lock that its thread has learned."""
         self._world.tally[f"told: {entry.told.value if entry.told else '-'}"] += 1
         applied = any(entry.id in picture.applied for picture in self._observed.pictures.values())
@@ -137,6 +137,6 @@ class ClientJudge:
         return volatile or entry.id in self._observed.permitted_losses
 
 
-def _believed(host: ClientHost) -> list[MultiLock]:
+def _believed(host: ClientNode) -> list[MultiLock]:
     now_ns = host.local_ns
     return [lock for lock in host.client.live_locks() if lock.valid(now_ns)]

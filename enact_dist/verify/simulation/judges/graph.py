@@ -12,12 +12,12 @@ from enact_dist.core.client.plan import Phase
 from enact_dist.terms import NullReason
 from enact_dist.verify.checker import (
     NOTHING,
-    Captured,
+    CapturedRead,
+    ChainState,
     Checker,
+    LockOutcome,
     LockStory,
-    Reading,
-    State,
-    Told,
+    StateRead,
 )
 from enact_dist.verify.simulation.judges.history import TOLD_NOT
 from enact_dist.verify.simulation.judges.picture import DROP, NEVER_SET
@@ -28,22 +28,23 @@ if TYPE_CHECKING:
 
     from enact_dist.core.client import plan as lock_parts
     from enact_dist.core.protocol.datum import Slot
-    from enact_dist.verify.simulation.judges.history import Entry, History, Observations
+    from enact_dist.verify.simulation.judges.history import Entry, Observations, RunHistory
 
 
-class Graph:
+class DependencyGraph:
     """Everything that committed in a simulated run, and in which order it can have done so."""
 
-    def __init__(self, history: History, observed: Observations) -> None:
+    def __init__(self, history: RunHistory, observed: Observations) -> None:
         self._observed = observed
         self._positions: dict[Slot, dict[tuple[int, int], list[tuple[int, int]]]] = {}
         self._drops: dict[Slot, list[tuple[str, int]]] = {}
         self._events: dict[str, tuple[int, int]] = {}
-        chains: dict[Slot, list[State]] = {}
+        chains: dict[Slot, list[ChainState]] = {}
         for picture in observed.pictures.values():
             for slot, chain in picture.chains.items():
                 chains[slot] = [
-                    State(i, s.writer, s.version, stamp_of(s.datum)) for i, s in enumerate(chain)
+                    ChainState(i, s.writer, s.version, stamp_of(s.datum))
+                    for i, s in enumerate(chain)
                 ]
                 positions = self._positions[slot] = {}
                 for index, state in enumerate(chain):
@@ -67,7 +68,7 @@ class Graph:
     def _story(self, entry: Entry) -> LockStory:
         reads = self._readings(entry, entry.readings())
         for (_, slot), (epoch, name) in self._observed.absent.get(entry.id, {}).items():
-            reads.append(Reading(slot, self._position(entry, slot, epoch, name)))
+            reads.append(StateRead(slot, self._position(entry, slot, epoch, name)))
         return LockStory(
             entry.id,
             entry.begun_ns,
@@ -79,21 +80,21 @@ class Graph:
             captured=self._captured(entry),
         )
 
-    def _readings(self, entry: Entry, found: Iterable[lock_parts.Reading]) -> list[Reading]:
+    def _readings(self, entry: Entry, found: Iterable[lock_parts.Reading]) -> list[StateRead]:
         readings = []
         for _, epoch, state in found:
             name = (state.version, state.stamp_ns)
-            readings.append(Reading(state.slot, self._position(entry, state.slot, epoch, name)))
+            readings.append(StateRead(state.slot, self._position(entry, state.slot, epoch, name)))
         return readings
 
-    def _captured(self, entry: Entry) -> list[Captured]:
+    def _captured(self, entry: Entry) -> list[CapturedRead]:
         stamps, found = entry.stamps(), []
         for _, epoch, state in entry.lock.states if stamps else ():
             captured_ns = stamps.get(state.slot)
             if captured_ns is not None:
                 gone = state.null_reason == NullReason.OUTSIDE_RETENTION.name
                 name = None if gone else self._position(entry, state.slot, epoch, state[1:3])
-                found.append(Captured(state.slot, name, captured_ns))
+                found.append(CapturedRead(state.slot, name, captured_ns))
         return found
 
     def _position(self, entry: Entry, slot: Slot, epoch: int, name: tuple[int, int]) -> int | None:
@@ -121,7 +122,7 @@ class Graph:
         return None if found is None else [str(edge) for edge in found]
 
 
-def _told(phase: Phase | None) -> Told:
+def _told(phase: Phase | None) -> LockOutcome:
     if phase is Phase.COMMITTED:
-        return Told.COMMITTED
-    return Told.NOT if phase in TOLD_NOT else Told.UNKNOWN
+        return LockOutcome.COMMITTED
+    return LockOutcome.NOT if phase in TOLD_NOT else LockOutcome.UNKNOWN

@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.datum import Datum, Slot
     from enact_dist.core.protocol.messages import AspectEntry
     from enact_dist.core.protocol.records import Effect
-    from enact_dist.verify.simulation.hosts.client_host import ClientHost
-    from enact_dist.verify.simulation.hosts.shard_host import ShardHost
-    from enact_dist.verify.simulation.hosts.world import World
+    from enact_dist.verify.simulation.hosts.client_host import ClientNode
+    from enact_dist.verify.simulation.hosts.shard_host import ShardNode
+    from enact_dist.verify.simulation.hosts.world import SimulatedWorld
     from enact_dist.verify.simulation.judges.history import Entry
-    from enact_dist.verify.simulation.judges.picture import Picture
+    from enact_dist.verify.simulation.judges.picture import ShardPicture
 
 OLDER: Final = "Number{value:int}"
 NEWER: Final = "Number{value:int,unit:str=}"
@@ -33,11 +33,11 @@ NEWER_ENCODING: Final = b"text with a unit"
 class GrowthJudge:
     """Looks at the types that a shard shows, lets in and refuses."""
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: SimulatedWorld) -> None:
         self._world, self._fail = world, world.violation
 
     def handled(
-        self, host: ShardHost, message: object, effects: Sequence[Effect], picture: Picture
+        self, host: ShardNode, message: object, effects: Sequence[Effect], picture: ShardPicture
     ) -> None:
         """Judge one step of a shard; before its locks are judged, which notes who has come."""
         if isinstance(message, Acquire) and picture.grown:
@@ -55,7 +55,9 @@ class GrowthJudge:
             elif isinstance(answer, Refused):
                 self._check_refused(host, asked, answer, picture)
 
-    def _check_shown(self, shard: str, aspects: Iterable[AspectEntry], picture: Picture) -> None:
+    def _check_shown(
+        self, shard: str, aspects: Iterable[AspectEntry], picture: ShardPicture
+    ) -> None:
         """The newer type is shown with the one that it succeeds, for good."""
         shown = {entry.name: entry for entry in aspects}
         for name, known in picture.grown.items():
@@ -68,14 +70,16 @@ class GrowthJudge:
                 picture.grown[entry.name] = entry
                 self._world.tally["types that have grown"] += 1
 
-    def _check_let_in(self, shard: str, aspects: Iterable[AspectEntry], picture: Picture) -> None:
+    def _check_let_in(
+        self, shard: str, aspects: Iterable[AspectEntry], picture: ShardPicture
+    ) -> None:
         for entry in aspects:
             known = picture.grown.get(entry.name)
             if known is not None and not entry.reads and succeeds(NEWER, entry.fingerprint):
                 self._fail("a writer of the older type is refused", shard, entry)
 
     def _check_refused(
-        self, host: ShardHost, asked: object, answer: Refused, picture: Picture
+        self, host: ShardNode, asked: object, answer: Refused, picture: ShardPicture
     ) -> None:
         shard = host.name
         if isinstance(asked, Acquire) and answer.code == NEWER_TYPE:
@@ -88,13 +92,18 @@ class GrowthJudge:
             if OLDER not in answer.text or NEWER not in answer.text:
                 self._fail("a refusal names both types", shard, answer)
 
-    def booted(self, host: ShardHost, picture: Picture) -> None:
+    def booted(self, host: ShardNode, picture: ShardPicture) -> None:
         """A shard started: it knows each newer type that it had acknowledged."""
         self._world.tally["newer types over a restart"] += len(picture.grown)
         self._check_shown(host.name, host.shard.state.catalogue.aspects.values(), picture)
 
     def committed(
-        self, entry: Entry, slot: Slot, before: Datum | None, datum: Datum | None, picture: Picture
+        self,
+        entry: Entry,
+        slot: Slot,
+        before: Datum | None,
+        datum: Datum | None,
+        picture: ShardPicture,
     ) -> None:
         """A datum became visible, in place of another one."""
         if slot.aspect not in picture.grown or entry.newer == slot.aspect:
@@ -105,7 +114,7 @@ class GrowthJudge:
             self._fail("a new field is not dropped", slot, entry.id)
         self._world.tally["locks of an older type that ended later"] += 1
 
-    def client_refused(self, host: ClientHost, entry: AspectEntry, answer: Refused) -> None:
+    def client_refused(self, host: ClientNode, entry: AspectEntry, answer: Refused) -> None:
         """A client was refused what it would write."""
         if entry.fingerprint != OLDER or answer.code != "datum_type":
             self._fail("nothing is refused", host.name, entry, answer)

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.datum import LockId
     from enact_dist.core.protocol.messages import Item
     from enact_dist.core.protocol.records import DecisionRecord
-    from enact_dist.verify.simulation.hosts.world import World
-    from enact_dist.verify.simulation.judges.picture import Picture
+    from enact_dist.verify.simulation.hosts.world import SimulatedWorld
+    from enact_dist.verify.simulation.judges.picture import ShardPicture
 
 TOLD_NOT = frozenset(
     (
@@ -93,7 +93,7 @@ class Entry:
 
 
 @dataclass(slots=True)
-class History:
+class RunHistory:
     """All locks of a run."""
 
     entries: dict[LockId, Entry] = field(default_factory=dict)
@@ -118,9 +118,11 @@ class Observations:
         clocks_were_set: Whether commits may be refused for a wall clock.
     """
 
-    def __init__(self, world: World, history: History, durabilities: dict[str, Durability]) -> None:
+    def __init__(
+        self, world: SimulatedWorld, history: RunHistory, durabilities: dict[str, Durability]
+    ) -> None:
         self.world, self.history, self.durabilities = world, history, durabilities
-        self.pictures: dict[str, Picture] = {}
+        self.pictures: dict[str, ShardPicture] = {}
         self.absent: dict[LockId, dict[tuple[str, Slot], tuple[int, tuple[int, int]]]] = {}
         self.permitted_losses: dict[LockId, None] = {}
         self.decided: dict[LockId, DecisionRecord] = {}

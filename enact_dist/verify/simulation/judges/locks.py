@@ -11,20 +11,20 @@ from enact_dist.verify.simulation.judges.history import conflict
 
 if TYPE_CHECKING:
     from enact_dist.core.state.grants import Tenure
-    from enact_dist.verify.simulation.hosts.shard_host import ShardHost
-    from enact_dist.verify.simulation.hosts.world import World
-    from enact_dist.verify.simulation.judges.picture import Picture
+    from enact_dist.verify.simulation.hosts.shard_host import ShardNode
+    from enact_dist.verify.simulation.hosts.world import SimulatedWorld
+    from enact_dist.verify.simulation.judges.picture import ShardPicture
 
 
 class LockJudge:
     """Looks at a shard's locks after each step."""
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: SimulatedWorld) -> None:
         self._fail = world.violation
         self._waits: dict[str, dict[LockId, list[LockId]]] = {}
-        self._hosts: dict[str, ShardHost] = {}
+        self._hosts: dict[str, ShardNode] = {}
 
-    def judge(self, host: ShardHost, message: object, picture: Picture) -> None:
+    def judge(self, host: ShardNode, message: object, picture: ShardPicture) -> None:
         """Note who came, went and was granted, and whether that was right."""
         tenures = host.shard.state.tenures.by_lock
         for lock in [lock for lock in picture.arrivals if lock not in tenures]:
@@ -57,7 +57,7 @@ class LockJudge:
             self._check_waiters(host, picture)
 
     def _check_grant(
-        self, host: ShardHost, tenure: Tenure, tenures: dict[LockId, Tenure], picture: Picture
+        self, host: ShardNode, tenure: Tenure, tenures: dict[LockId, Tenure], picture: ShardPicture
     ) -> None:
         lock, token = tenure.lock, tenure.token
         assert token is not None
@@ -87,7 +87,7 @@ class LockJudge:
             if unwanted and not (tenure.committing or tenure.prepared):
                 self._fail("orphans are freed", lock, message.view)
 
-    def _check_ends(self, host: ShardHost) -> None:
+    def _check_ends(self, host: ShardNode) -> None:
         """After a look at the clock no grant is left that should have ended."""
         state = host.shard.state
         for lock, tenure in state.tenures.by_lock.items():
@@ -97,7 +97,7 @@ class LockJudge:
             if min(tenure.hold_end_ns, lease_end_ns) <= state.now_ns:
                 self._fail("leases and hold limits end", lock, tenure.hold_end_ns, lease_end_ns)
 
-    def _check_outcomes(self, host: ShardHost, picture: Picture) -> None:
+    def _check_outcomes(self, host: ShardNode, picture: ShardPicture) -> None:
         """I14: what is remembered of commits is one entry per lane that ever asked here."""
         sessions = host.shard.state.sessions
         for session in sessions:
@@ -105,7 +105,7 @@ class LockJudge:
                 if (session.session, lane) not in picture.lanes:
                     self._fail("I14 one outcome per lane", session.session, lane)
 
-    def _check_waiters(self, host: ShardHost, picture: Picture) -> None:
+    def _check_waiters(self, host: ShardNode, picture: ShardPicture) -> None:
         """Each waiter waits for a holder or an earlier request, and never in a cycle."""
         state = host.shard.state
         everybody = list(state.tenures.by_lock.values())

@@ -53,7 +53,7 @@ from enact_dist.verify.simulation.judges.growth import GrowthJudge
 from enact_dist.verify.simulation.judges.history import TOLD_NOT, Observations
 from enact_dist.verify.simulation.judges.locks import LockJudge
 from enact_dist.verify.simulation.judges.past import PastJudge
-from enact_dist.verify.simulation.judges.picture import Picture, State
+from enact_dist.verify.simulation.judges.picture import CommittedState, ShardPicture
 from enact_dist.verify.simulation.judges.prefixes import judge_prefixes
 from enact_dist.verify.simulation.judges.readers import ReaderJudge, stamp_of
 from enact_dist.verify.simulation.judges.worlds import WorldJudge
@@ -63,15 +63,17 @@ if TYPE_CHECKING:
 
     from enact_dist.core.protocol.messages import AspectEntry
     from enact_dist.core.protocol.records import Effect
-    from enact_dist.verify.simulation.hosts.shard_host import ShardHost
-    from enact_dist.verify.simulation.hosts.world import World
-    from enact_dist.verify.simulation.judges.history import History
+    from enact_dist.verify.simulation.hosts.shard_host import ShardNode
+    from enact_dist.verify.simulation.hosts.world import SimulatedWorld
+    from enact_dist.verify.simulation.judges.history import RunHistory
 
 
 class Model(Observations):
     """The judge of a running simulation."""
 
-    def __init__(self, world: World, history: History, aspects: Iterable[AspectEntry]) -> None:
+    def __init__(
+        self, world: SimulatedWorld, history: RunHistory, aspects: Iterable[AspectEntry]
+    ) -> None:
         aspects = tuple(aspects)
         super().__init__(
             world, history, {entry.name: Durability(entry.durability) for entry in aspects}
@@ -88,11 +90,11 @@ class Model(Observations):
 
     # ---------------------------------------------------------------- restart
 
-    def judge_prefixes(self, host: ShardHost, *, power_cut: bool) -> None:
+    def judge_prefixes(self, host: ShardNode, *, power_cut: bool) -> None:
         """A shard is about to lose what a crash may take: could it start from any rest?"""
         judge_prefixes(host, self.pictures[host.name], self.durabilities, power_cut=power_cut)
 
-    def crashed(self, host: ShardHost, lost: list[Persist], *, power_cut: bool) -> None:
+    def crashed(self, host: ShardNode, lost: list[Persist], *, power_cut: bool) -> None:
         """A shard died and its disk lost these records: was it allowed to?"""
         picture = self.pictures[host.name]
         gone = {id(persist) for persist in lost}
@@ -115,7 +117,7 @@ class Model(Observations):
         picture.prepared.clear()
         picture.applied = {lock: None for lock in picture.applied if lock not in losses}
 
-    def _check_promises(self, lost: list[Persist], picture: Picture) -> None:
+    def _check_promises(self, lost: list[Persist], picture: ShardPicture) -> None:
         """Nothing takes a promise that was given, nor the end of one that is decided."""
         for persist in lost:
             for record in persist.records:
@@ -124,7 +126,9 @@ class Model(Observations):
                 if isinstance(record, PreparedEnded) and record.lock in picture.applied:
                     self.fail("an end of a promise survives", record.lock, persist.durability)
 
-    def _found(self, host: ShardHost, lock: LockId, persist: Persist, picture: Picture) -> None:
+    def _found(
+        self, host: ShardNode, lock: LockId, persist: Persist, picture: ShardPicture
+    ) -> None:
         """What was under way at a crash turned out to be on disk."""
         for record in persist.records:
             if isinstance(record, DecisionRecord):
@@ -138,9 +142,9 @@ class Model(Observations):
             self._put_all(lock, versions, picture, datum_of)
             picture.applied[lock] = persist
 
-    def booted(self, host: ShardHost, recovered: Recovered, *, crashed_at_ns: int) -> None:
+    def booted(self, host: ShardNode, recovered: Recovered, *, crashed_at_ns: int) -> None:
         """A shard started: what it recovered becomes one writer of all slots in the history."""
-        picture = self.pictures.setdefault(host.name, Picture())
+        picture = self.pictures.setdefault(host.name, ShardPicture())
         if recovered.epoch <= picture.epoch:
             self.fail("epochs grow", recovered.epoch, picture.epoch)
         picture.epoch = recovered.epoch
@@ -164,7 +168,7 @@ class Model(Observations):
             if name != before.name:
                 # What is prepared here comes later, however early it was decided elsewhere.
                 by = f"{writer} under {prepared[slot]}" if slot in prepared else writer
-                picture.put(slot, State(*name, by, picture.epoch, content.datum))
+                picture.put(slot, CommittedState(*name, by, picture.epoch, content.datum))
             elif before.version and stamp_of(content.datum) != stamp_of(before.datum):
                 self.fail("a datum keeps its capture stamp", slot, content, before)
             picture.restarted_at[slot] = len(picture.chains[slot]) - 1
@@ -192,7 +196,7 @@ class Model(Observations):
 
     # ---------------------------------------------------------------- one step of a shard
 
-    def handled(self, host: ShardHost, message: object, effects: Sequence[Effect]) -> None:
+    def handled(self, host: ShardNode, message: object, effects: Sequence[Effect]) -> None:
         """Judge one step: what came in, and what the shard decided."""
         picture = self.pictures[host.name]
         acknowledged = isinstance(message, Hello) and message.known_epoch == picture.epoch
@@ -225,13 +229,15 @@ class Model(Observations):
                 if lock in picture.granted_ever:  # else it only expected something here
                     picture.confirmed[lock] = picture.granted_ever[lock]
 
-    def _judge_past(self, answer: object, asked: TakeView, picture: Picture) -> None:
+    def _judge_past(self, answer: object, asked: TakeView, picture: ShardPicture) -> None:
         if isinstance(answer, Viewed):
             self._pasts.check_view(answer, asked.at_ns, asked.items, picture)
         elif isinstance(answer, Forgotten):
             self._pasts.check_forgotten(answer, asked, picture)
 
-    def _check_commits(self, host: ShardHost, effects: Sequence[Effect], picture: Picture) -> None:
+    def _check_commits(
+        self, host: ShardNode, effects: Sequence[Effect], picture: ShardPicture
+    ) -> None:
         told = {
             effect.answer.position.stamp_ns: effect.answer
             for effect in effects
@@ -258,7 +264,7 @@ class Model(Observations):
                 else:
                     self._finished(host, effect.notice, picture)
 
-    def _check_persist(self, persist: Persist, picture: Picture) -> None:
+    def _check_persist(self, persist: Persist, picture: ShardPicture) -> None:
         for record in persist.records:
             if isinstance(record, OutcomeRecord):
                 picture.in_flight[record.lock] = persist
@@ -283,7 +289,7 @@ class Model(Observations):
                 if record.lock in picture.applied:
                     self.fail("I9 applied and aborted", record.lock)
 
-    def _check_prepared(self, host: ShardHost, answer: Prepared, picture: Picture) -> None:
+    def _check_prepared(self, host: ShardNode, answer: Prepared, picture: ShardPicture) -> None:
         record = picture.preparing.pop(answer.lock, None)
         if record is not None:
             picture.prepared[answer.lock] = record
@@ -298,7 +304,7 @@ class Model(Observations):
         ):
             self.fail("a promise is on disk before it is given", answer)
 
-    def _check_end_told(self, host: ShardHost, lock: LockId, picture: Picture) -> None:
+    def _check_end_told(self, host: ShardNode, lock: LockId, picture: ShardPicture) -> None:
         """Once a participant reports the end, the primary may forget the decision."""
         persist = picture.in_flight.get(lock)
         if persist is not None and not any(
@@ -306,7 +312,7 @@ class Model(Observations):
         ):
             self.fail("an end is on disk before it is confirmed", lock)
 
-    def _finished(self, host: ShardHost, notice: Notice, picture: Picture) -> None:
+    def _finished(self, host: ShardNode, notice: Notice, picture: ShardPicture) -> None:
         """A participant has applied what it had prepared."""
         slots = {change.slot for change in notice.changes}
         for lock, record in picture.prepared.items():
@@ -324,11 +330,11 @@ class Model(Observations):
 
     def _applied(
         self,
-        host: ShardHost,
+        host: ShardNode,
         lock: LockId,
         expected: list[SlotVersion],
         notice: Notice,
-        picture: Picture,
+        picture: ShardPicture,
     ) -> None:
         """A commit became visible."""
         persist = picture.in_flight.pop(lock, None)
@@ -364,7 +370,7 @@ class Model(Observations):
                 self.fail("I12 nothing stays prepared", name, list(picture.prepared))
 
     def _check_on_disk(
-        self, host: ShardHost, lock: LockId, persist: Persist | None, notice: Notice
+        self, host: ShardNode, lock: LockId, persist: Persist | None, notice: Notice
     ) -> None:
         strictest = {self.durabilities[change.slot.aspect] for change in notice.changes}
         if strictest == {Durability.VOLATILE}:
@@ -376,10 +382,10 @@ class Model(Observations):
 
     def _apply(
         self,
-        host: ShardHost,
+        host: ShardNode,
         lock: LockId,
         persist: Persist,
-        picture: Picture,
+        picture: ShardPicture,
         *,
         datum_of: dict[Slot, Datum | None],
     ) -> None:
@@ -396,7 +402,7 @@ class Model(Observations):
         self,
         lock: LockId,
         versions: dict[Slot, tuple[int, int]],
-        picture: Picture,
+        picture: ShardPicture,
         datum_of: dict[Slot, Datum | None],
     ) -> None:
         if lock in picture.applied:
@@ -416,9 +422,11 @@ class Model(Observations):
                 self.growth.committed(entry, slot, before.datum, datum, picture)
             if datum is not None:
                 self._check_content(lock, slot, before, datum)
-            picture.put(slot, State(version, stamp_ns, lock, picture.epoch, datum))
+            picture.put(slot, CommittedState(version, stamp_ns, lock, picture.epoch, datum))
 
-    def _check_content(self, lock: LockId, slot: Slot, before: State, datum: Datum) -> None:
+    def _check_content(
+        self, lock: LockId, slot: Slot, before: CommittedState, datum: Datum
+    ) -> None:
         if writer_of(datum) != str(lock):
             self.fail("a commit publishes its own data", slot, datum)
         if len(datum.body) != datum.size or bytes(datum.body[FILLED:]).strip(b"."):
@@ -434,7 +442,7 @@ class Model(Observations):
             self.fail("no lost update", slot, old, datum)
 
 
-def _names(chain: list[State]) -> set[tuple[int, int]]:
+def _names(chain: list[CommittedState]) -> set[tuple[int, int]]:
     return {state.name for state in chain} | {(0, 0)}
 
 

@@ -20,7 +20,7 @@ from enact_dist.core.protocol.messages import (
 from enact_dist.patterns import pattern_matches
 from enact_dist.terms import Access, NullReason
 from enact_dist.verify.simulation.cells import CONTEXTS
-from enact_dist.verify.simulation.judges.picture import NEVER_SET, State
+from enact_dist.verify.simulation.judges.picture import NEVER_SET, CommittedState
 from enact_dist.verify.simulation.judges.readers import stamp_of
 
 if TYPE_CHECKING:
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 
     from enact_dist.core.protocol.messages import Forgotten, Item, SlotState, VersionEntry, Versions
     from enact_dist.core.protocol.records import Recovered
-    from enact_dist.verify.simulation.hosts.shard_host import ShardHost
+    from enact_dist.verify.simulation.hosts.shard_host import ShardNode
     from enact_dist.verify.simulation.judges.history import Observations
-    from enact_dist.verify.simulation.judges.picture import Picture
+    from enact_dist.verify.simulation.judges.picture import ShardPicture
 
 
 class PastJudge:
@@ -44,7 +44,7 @@ class PastJudge:
     # ---------------------------------------------------------------- as of a stamp
 
     def check_view(
-        self, answer: Viewed, at_ns: int, items: Iterable[Item], picture: Picture
+        self, answer: Viewed, at_ns: int, items: Iterable[Item], picture: ShardPicture
     ) -> None:
         """A strict view shows every slot as it was then, those that were deleted since, too."""
         if answer.until_ns < at_ns:
@@ -62,7 +62,9 @@ class PastJudge:
                 self._check_state(state, right, at_ns, picture)
             self._observed.count("data shown as of long ago", right.name != picture.now(slot).name)
 
-    def _check_state(self, state: SlotState, right: State, at_ns: int, picture: Picture) -> None:
+    def _check_state(
+        self, state: SlotState, right: CommittedState, at_ns: int, picture: ShardPicture
+    ) -> None:
         found = state.version, state.stamp_ns, state.captured_ns
         if found != (*right.name, stamp_of(right.datum)):
             self._fail("a view of the past shows what was", state, at_ns, right)
@@ -71,7 +73,7 @@ class PastJudge:
         if state.null_reason == NullReason.LOST.name and at_ns < picture.started_ns:
             self._fail("what was before a restart is forgotten, not null", state, at_ns)
 
-    def _reasons(self, slot: Slot, right: State, picture: Picture) -> tuple[str, ...]:
+    def _reasons(self, slot: Slot, right: CommittedState, picture: ShardPicture) -> tuple[str, ...]:
         if right.datum is not None:
             return ("",)
         if right.version:
@@ -83,7 +85,7 @@ class PastJudge:
             return (NullReason.LOST.name, *([NullReason.NEVER_SET.name] if unknown else []))
         return (NullReason.NEVER_SET.name,)
 
-    def check_forgotten(self, answer: Forgotten, asked: TakeView, picture: Picture) -> None:
+    def check_forgotten(self, answer: Forgotten, asked: TakeView, picture: ShardPicture) -> None:
         """Only data that may be forgotten are, and data reported as known are known.
 
         A restart may know a slot from a prepared commit alone, whose data a power cut took: this
@@ -100,11 +102,11 @@ class PastJudge:
             self._fail("it is said since when all is known", answer, asked, latest_ns)
         self._observed.count("views of what is forgotten", 1)
 
-    def _must_know(self, slot: Slot, at_ns: int, picture: Picture) -> bool:
+    def _must_know(self, slot: Slot, at_ns: int, picture: ShardPicture) -> bool:
         kept = picture.labels_of(slot)
         return self._since_ns(slot, picture) <= at_ns or any(s.stamp_ns == at_ns for s in kept)
 
-    def _since_ns(self, slot: Slot, picture: Picture) -> int:
+    def _since_ns(self, slot: Slot, picture: ShardPicture) -> int:
         """Return the stamp from which on a slot must be known."""
         volatile = self._observed.is_volatile(slot)
         line = picture.line(slot, volatile=volatile)
@@ -113,7 +115,7 @@ class PastJudge:
             return held[0].stamp_ns
         return picture.started_ns if volatile and picture.epoch > 1 else 0
 
-    def _asked(self, items: Iterable[Item], picture: Picture) -> Iterator[tuple[Slot, bool]]:
+    def _asked(self, items: Iterable[Item], picture: ShardPicture) -> Iterator[tuple[Slot, bool]]:
         """Yield the slots that items name or match, as far as the judge knows them."""
         for item in items:
             if item.context not in CONTEXTS:
@@ -127,7 +129,7 @@ class PastJudge:
 
     # ---------------------------------------------------------------- lists
 
-    def check_list(self, message: ListHistory, answer: Versions, picture: Picture) -> None:
+    def check_list(self, message: ListHistory, answer: Versions, picture: ShardPicture) -> None:
         """A list names every version that is retained or kept, oldest first, with its time."""
         told: dict[Slot, list[VersionEntry]] = {}
         for entry in answer.entries:
@@ -136,7 +138,7 @@ class PastJudge:
             if slot.context in message.contexts and slot.aspect in message.aspects:
                 self._check_entries(slot, told.get(slot, []), picture)
 
-    def _check_entries(self, slot: Slot, found: list[VersionEntry], picture: Picture) -> None:
+    def _check_entries(self, slot: Slot, found: list[VersionEntry], picture: ShardPicture) -> None:
         line = picture.line(slot, volatile=self._observed.is_volatile(slot))
         held = line[-self._retentions[slot.aspect] :]
         kept = {state.version: state for state in picture.labels_of(slot)}
@@ -157,7 +159,7 @@ class PastJudge:
 
     # ---------------------------------------------------------------- labels
 
-    def take_keep(self, host: ShardHost, message: KeepVersions, picture: Picture) -> None:
+    def take_keep(self, host: ShardNode, message: KeepVersions, picture: ShardPicture) -> None:
         """A label keeps what it kept, and what was added, or nothing any more."""
         before = picture.labels.get(message.label, {})
         history = host.shard.state.slots.history
@@ -176,7 +178,7 @@ class PastJudge:
         picture.confirmed_labels.pop(message.label, None)
         self._observed.count("labels changed", 1)
 
-    def _state(self, key: SlotVersion, picture: Picture) -> State:
+    def _state(self, key: SlotVersion, picture: ShardPicture) -> CommittedState:
         line = picture.line(key.slot, volatile=self._observed.is_volatile(key.slot))
         for state in (*reversed(line), *picture.labels_of(key.slot)):
             if state.version == key.version:
@@ -184,13 +186,13 @@ class PastJudge:
         self._fail("only what was committed is kept", key)
         raise AssertionError(key)
 
-    def check_kept(self, asked: KeepVersions, answer: Kept, picture: Picture) -> None:
+    def check_kept(self, asked: KeepVersions, answer: Kept, picture: ShardPicture) -> None:
         """Versions that a shard keeps under a label survive; a further page promises none."""
         kept = picture.labels.get(asked.label)
         if asked.after == START and kept is not None and set(kept) == set(answer.versions):
             picture.confirmed_labels[asked.label] = None
 
-    def booted(self, host: ShardHost, recovered: Recovered, picture: Picture) -> None:
+    def booted(self, host: ShardNode, recovered: Recovered, picture: ShardPicture) -> None:
         """What a label keeps, and the disk has, is kept after a restart."""
         slots = host.shard.state.slots
         stamps = [record.stamp_ns for record in recovered.slots]

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.records import Persist, PreparedRecord
 
 
-class State(NamedTuple):
+class CommittedState(NamedTuple):
     """One committed state of a slot: `writer` is a lock, or the restart that left it so."""
 
     version: int
@@ -29,11 +29,11 @@ class State(NamedTuple):
 
 DROP = "drop of "
 """So begins the writer of the state in which a dropped context leaves its slots."""
-NEVER_SET = State(0, 0, "no lock", 0, None)
+NEVER_SET = CommittedState(0, 0, "no lock", 0, None)
 
 
 @dataclass(slots=True)
-class Picture:
+class ShardPicture:
     """What the model knows of one shard.
 
     `restarted_at` is where in its chain a slot stood when the shard last started, or its context
@@ -46,7 +46,7 @@ class Picture:
     """
 
     epoch: int = 0
-    chains: dict[Slot, list[State]] = field(default_factory=dict)
+    chains: dict[Slot, list[CommittedState]] = field(default_factory=dict)
     restarted_at: dict[Slot, int] = field(default_factory=dict)
     columns: dict[tuple[str, str], dict[Slot, None]] = field(default_factory=dict)
     in_flight: dict[LockId, Persist] = field(default_factory=dict)
@@ -70,12 +70,12 @@ class Picture:
     vanished: frozenset[Slot] = frozenset()
     started_ns: int = 0
     promised: dict[Slot, int] = field(default_factory=dict)
-    labels: dict[str, dict[SlotVersion, State]] = field(default_factory=dict)
+    labels: dict[str, dict[SlotVersion, CommittedState]] = field(default_factory=dict)
     confirmed_labels: dict[str, None] = field(default_factory=dict)
     grown: dict[str, AspectEntry] = field(default_factory=dict)
     late: dict[LockId, None] = field(default_factory=dict)
 
-    def now(self, slot: Slot) -> State:
+    def now(self, slot: Slot) -> CommittedState:
         """Return the newest committed state of a slot."""
         chain = self.chains.get(slot)
         return chain[-1] if chain else NEVER_SET
@@ -84,20 +84,20 @@ class Picture:
         """Return the version that the next write of a slot makes."""
         return (self.now(slot).version or self.bases.get(slot.context, 0)) + 1
 
-    def at(self, slot: Slot, stamp_ns: int) -> State:
+    def at(self, slot: Slot, stamp_ns: int) -> CommittedState:
         """Return the committed state of a slot as of a stamp."""
         for state in reversed(self.chains.get(slot, [])):
             if state.stamp_ns <= stamp_ns:
                 return state
         return NEVER_SET
 
-    def line(self, slot: Slot, *, volatile: bool) -> list[State]:
+    def line(self, slot: Slot, *, volatile: bool) -> list[CommittedState]:
         """Return the versions that led to the newest one, oldest first, without what is lost.
 
         A power cut may take versions of class `os` back; of a volatile slot a restart leaves none.
         """
         chain = self.chains.get(slot, [])
-        found: list[State] = []
+        found: list[CommittedState] = []
         for state in reversed(chain[self.restarted_at.get(slot, 0) if volatile else 0 :]):
             if not state.version:
                 break  # a restart has lost the slot with all that it had
@@ -105,12 +105,12 @@ class Picture:
                 found.append(state)
         return found[::-1]
 
-    def labels_of(self, slot: Slot) -> list[State]:
+    def labels_of(self, slot: Slot) -> list[CommittedState]:
         """Return the versions of a slot that labels keep, each once."""
         kept = (item for versions in self.labels.values() for item in versions.items())
         return list({key.version: state for key, state in kept if key.slot == slot}.values())
 
-    def put(self, slot: Slot, state: State) -> None:
+    def put(self, slot: Slot, state: CommittedState) -> None:
         """Add a state to the chain of a slot."""
         self.chains.setdefault(slot, []).append(state)
         self.columns.setdefault((slot.context, slot.aspect), {})[slot] = None

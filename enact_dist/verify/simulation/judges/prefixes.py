@@ -16,12 +16,12 @@ from enact_dist.verify.simulation.judges.history import conflict
 if TYPE_CHECKING:
     from enact_dist.core.protocol.datum import Slot
     from enact_dist.core.protocol.records import Recovered
-    from enact_dist.verify.simulation.hosts.shard_host import ShardHost
-    from enact_dist.verify.simulation.judges.picture import Picture
+    from enact_dist.verify.simulation.hosts.shard_host import ShardNode
+    from enact_dist.verify.simulation.judges.picture import ShardPicture
 
 
 def judge_prefixes(
-    host: ShardHost, picture: Picture, durabilities: dict[str, Durability], *, power_cut: bool
+    host: ShardNode, picture: ShardPicture, durabilities: dict[str, Durability], *, power_cut: bool
 ) -> None:
     """Start a shard from every prefix that this crash may leave, and look at it."""
     for count in host.disk.keepable(power_cut=power_cut):
@@ -36,10 +36,10 @@ def judge_prefixes(
 
 
 def _judge_slots(
-    host: ShardHost,
+    host: ShardNode,
     shard: Shard,
     left: Recovered,
-    picture: Picture,
+    picture: ShardPicture,
     durabilities: dict[str, Durability],
     *,
     power_cut: bool,
@@ -60,7 +60,7 @@ def _judge_slots(
             host.world.violation("I15 no prefix loses", slot, version, picture.now(slot))
 
 
-def _judge_outcomes(host: ShardHost, left: Recovered, durabilities: dict[str, Durability]) -> None:
+def _judge_outcomes(host: ShardNode, left: Recovered, durabilities: dict[str, Durability]) -> None:
     """An outcome that is kept has all that it tells of, unless its context was dropped since."""
     found: dict[Slot, int] = {record.slot: record.version for record in left.slots}
     gone = {record.name: record.version_base for record in left.dropped}
@@ -82,7 +82,7 @@ def _judge_outcomes(host: ShardHost, left: Recovered, durabilities: dict[str, Du
             host.world.violation("I15 an outcome has its writes", outcome, missing, early)
 
 
-def _judge_prepared(host: ShardHost, shard: Shard, left: Recovered) -> None:
+def _judge_prepared(host: ShardNode, shard: Shard, left: Recovered) -> None:
     """What is prepared holds its locks again, and nothing else does."""
     held = shard.state.tenures.by_lock
     for record in left.prepared:

@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.core.protocol.messages import Granted, Survey, Viewed
 from enact_dist.patterns import pattern_matches
 from enact_dist.terms import Access, NullReason
-from enact_dist.verify.simulation.judges.picture import State
+from enact_dist.verify.simulation.judges.picture import CommittedState
 
 if TYPE_CHECKING:
     from enact_dist.core.protocol.datum import Datum, Slot
     from enact_dist.core.protocol.messages import Item, SlotState, Surveyed
-    from enact_dist.verify.simulation.hosts.shard_host import ShardHost
+    from enact_dist.verify.simulation.hosts.shard_host import ShardNode
     from enact_dist.verify.simulation.judges.history import Observations
-    from enact_dist.verify.simulation.judges.picture import Picture
+    from enact_dist.verify.simulation.judges.picture import ShardPicture
 
-OUTSIDE: Final = State(0, 0, "no lock", 0, None)
+OUTSIDE: Final = CommittedState(0, 0, "no lock", 0, None)
 """What stands for a version that is not retained."""
 
 
@@ -38,7 +38,7 @@ class ReaderJudge:
         self._fail = observed.fail
         self._retentions = retentions
 
-    def check(self, host: ShardHost, answer: Granted | Viewed, picture: Picture) -> None:
+    def check(self, host: ShardNode, answer: Granted | Viewed, picture: ShardPicture) -> None:
         """I18: an answer shows one committed moment, and all of it."""
         entry = self._observed.entry(answer.lock)
         items = entry.items if entry is not None else ()
@@ -58,7 +58,9 @@ class ReaderJudge:
 
     # ---------------------------------------------------------------- the newest version
 
-    def _check_current(self, answer: Granted | Viewed, state: SlotState, picture: Picture) -> None:
+    def _check_current(
+        self, answer: Granted | Viewed, state: SlotState, picture: ShardPicture
+    ) -> None:
         now = picture.now(state.slot)
         name = (state.version, state.stamp_ns)
         if name != now.name and isinstance(answer, Viewed):
@@ -75,7 +77,7 @@ class ReaderJudge:
         if state.captured_ns != stamp_of(now.datum):
             self._fail("a datum keeps its capture stamp", state, now)
 
-    def _check_interval(self, answer: Viewed, slot: Slot, picture: Picture) -> None:
+    def _check_interval(self, answer: Viewed, slot: Slot, picture: ShardPicture) -> None:
         """What a view says was current from one stamp to another was so all the time."""
         first, last = picture.at(slot, answer.from_ns), picture.at(slot, answer.until_ns)
         if first is not last:
@@ -84,7 +86,7 @@ class ReaderJudge:
     # ---------------------------------------------------------------- by capture stamp
 
     def _check_captured(
-        self, answer: Granted | Viewed, state: SlotState, captured_ns: int, picture: Picture
+        self, answer: Granted | Viewed, state: SlotState, captured_ns: int, picture: ShardPicture
     ) -> None:
         slot = state.slot
         moments = [picture.now(slot)]
@@ -106,7 +108,9 @@ class ReaderJudge:
         if moments[-1] is not newest:
             self._observed.count("stamped views of the past", 1)
 
-    def _captured(self, picture: Picture, slot: Slot, newest: State, captured_ns: int) -> State:
+    def _captured(
+        self, picture: ShardPicture, slot: Slot, newest: CommittedState, captured_ns: int
+    ) -> CommittedState:
         """Return what a slot that is at `newest` has to show for a capture stamp."""
         if stamp_of(newest.datum) == captured_ns:
             return newest
@@ -115,7 +119,7 @@ class ReaderJudge:
                 return old
         return newest if newest.datum is None else OUTSIDE
 
-    def _retained(self, picture: Picture, slot: Slot) -> list[State]:
+    def _retained(self, picture: ShardPicture, slot: Slot) -> list[CommittedState]:
         """Return the replaced versions that a shard still has, oldest first.
 
         A restart leaves what is on the disk, and of volatile slots nothing.
@@ -123,7 +127,7 @@ class ReaderJudge:
         line = picture.line(slot, volatile=self._observed.is_volatile(slot))
         return line[-self._retentions[slot.aspect] : -1]
 
-    def check_survey(self, message: Survey, answer: Surveyed, picture: Picture) -> None:
+    def check_survey(self, message: Survey, answer: Surveyed, picture: ShardPicture) -> None:
         """A survey names every version that is retained, oldest first, and then the newest."""
         told: dict[Slot, list[SlotState]] = {}
         for state in answer.states:
@@ -148,7 +152,7 @@ class ReaderJudge:
     # ---------------------------------------------------------------- patterns
 
     def _check_patterns_of_view(
-        self, host: ShardHost, answer: Viewed, items: tuple[Item, ...], picture: Picture
+        self, host: ShardNode, answer: Viewed, items: tuple[Item, ...], picture: ShardPicture
     ) -> None:
         if answer.from_ns > answer.until_ns:
             return  # of no one moment, and it says so
@@ -160,7 +164,9 @@ class ReaderJudge:
                         self._fail("I18 a viewed pattern shows all that match", item, slot)
                     self._check_interval(answer, slot, picture)
 
-    def _check_patterns_of_grant(self, host: ShardHost, answer: Granted, picture: Picture) -> None:
+    def _check_patterns_of_grant(
+        self, host: ShardNode, answer: Granted, picture: ShardPicture
+    ) -> None:
         shown = {state.slot for state in answer.states}
         absent = self._observed.absent.setdefault(answer.lock, {})
         for known in [known for known in absent if known[0] == host.name]:
@@ -180,7 +186,7 @@ def stamp_of(datum: Datum | None) -> int:
     return datum.stamp_ns if datum is not None else 0
 
 
-def _is_shown(state: SlotState, right: State) -> bool:
+def _is_shown(state: SlotState, right: CommittedState) -> bool:
     if right is OUTSIDE and state.null_reason != NullReason.OUTSIDE_RETENTION.name:
         return False
     null = right.datum is None
@@ -202,6 +208,6 @@ def _is_surveyed(message: Survey, slot: Slot) -> bool:
     )
 
 
-def _not_shown(item: Item, shown: set[Slot], picture: Picture) -> list[Slot]:
+def _not_shown(item: Item, shown: set[Slot], picture: ShardPicture) -> list[Slot]:
     column = picture.columns.get((item.context, item.aspect), {})
     return [s for s in column if s not in shown and pattern_matches(item.entity, s.entity)]

@@ -13,7 +13,7 @@ from enact_dist.core.protocol.parts import CAUSE_FORK
 from enact_dist.core.protocol.records import Reply, WorldDropped, WorldRecord
 from enact_dist.terms import Durability
 from enact_dist.verify.simulation.hosts.payloads import copied
-from enact_dist.verify.simulation.judges.picture import DROP, NEVER_SET, State
+from enact_dist.verify.simulation.judges.picture import DROP, NEVER_SET, CommittedState
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.datum import Slot
     from enact_dist.core.protocol.messages import Notice
     from enact_dist.core.protocol.records import Content, Effect, Recovered
-    from enact_dist.verify.simulation.hosts.shard_host import ShardHost
+    from enact_dist.verify.simulation.hosts.shard_host import ShardNode
     from enact_dist.verify.simulation.judges.history import Observations
-    from enact_dist.verify.simulation.judges.picture import Picture
+    from enact_dist.verify.simulation.judges.picture import ShardPicture
 
 
 class WorldJudge:
@@ -36,7 +36,7 @@ class WorldJudge:
 
     # ---------------------------------------------------------------- one step of a shard
 
-    def judge(self, host: ShardHost, effects: Sequence[Effect], picture: Picture) -> None:
+    def judge(self, host: ShardNode, effects: Sequence[Effect], picture: ShardPicture) -> None:
         """Take note of what was forked or dropped in this step."""
         self._to_tell.clear()
         for effect in effects:
@@ -67,7 +67,7 @@ class WorldJudge:
         if self._to_tell:
             self._fail("watchers learn of forks and drops", self._to_tell)
 
-    def _made(self, host: ShardHost, world: WorldEntry, picture: Picture) -> None:
+    def _made(self, host: ShardNode, world: WorldEntry, picture: ShardPicture) -> None:
         """A fork is there: it has what its source had, and nothing else."""
         wanted = _as_of(picture, world)
         found = dict(host.shard.state.slots.of_context(world.name))
@@ -87,9 +87,9 @@ class WorldJudge:
         self,
         slot: Slot,
         content: Content,
-        source: State,
+        source: CommittedState,
         world: WorldEntry,
-        picture: Picture,
+        picture: ShardPicture,
     ) -> None:
         version = picture.bases.get(slot.context, 0) + 1
         if content.stamp_ns != world.at_ns:
@@ -103,18 +103,18 @@ class WorldJudge:
         if cause is None or (cause.kind, cause.reads) != (CAUSE_FORK, (read,)):
             self._fail("a fork's lineage goes on in its source", slot, cause, source)
 
-    def _put(self, slot: Slot, content: Content, world: WorldEntry, picture: Picture) -> None:
-        state = State(
+    def _put(self, slot: Slot, content: Content, world: WorldEntry, picture: ShardPicture) -> None:
+        state = CommittedState(
             content.version, world.at_ns, _writer(world), picture.epoch, copied(content.datum)
         )
         picture.put(slot, state)
 
-    def _enter(self, world: WorldEntry, picture: Picture) -> None:
+    def _enter(self, world: WorldEntry, picture: ShardPicture) -> None:
         now_ns = self._observed.world.now_ns
         picture.worlds[world.name] = world
         picture.restarts.append((_writer(world), now_ns, now_ns))
 
-    def _dropped(self, host: ShardHost, name: str, picture: Picture) -> None:
+    def _dropped(self, host: ShardNode, name: str, picture: ShardPicture) -> None:
         """A context is gone: no client was in it, and nothing is left but the base of versions."""
         for tenure in host.shard.state.tenures.by_lock.values():
             if any(item.context == name for item in tenure.items):
@@ -133,21 +133,21 @@ class WorldJudge:
             self._gone(record, picture)
             self._observed.count("worlds dropped", 1)
 
-    def _gone(self, record: WorldDropped, picture: Picture) -> None:
+    def _gone(self, record: WorldDropped, picture: ShardPicture) -> None:
         now_ns = self._observed.world.now_ns
         writer = DROP + _writer(picture.worlds.pop(record.name))
         for slot, state in _of_context(picture, record.name):
             told = state.version + (state.datum is not None)
             if record.version_base < max(told, picture.bases.get(record.name, 0)):
                 self._fail("the versions of a context are never used twice", record, slot, state)
-            picture.put(slot, State(0, 0, writer, picture.epoch, None))
+            picture.put(slot, CommittedState(0, 0, writer, picture.epoch, None))
             picture.restarted_at[slot] = len(picture.chains[slot]) - 1
         picture.bases[record.name] = record.version_base
         picture.restarts.append((writer, now_ns, now_ns))
 
     # ---------------------------------------------------------------- restart
 
-    def booted(self, host: ShardHost, recovered: Recovered, picture: Picture) -> None:
+    def booted(self, host: ShardNode, recovered: Recovered, picture: ShardPicture) -> None:
         """A shard started: forks and drops that it has found on its disk count from now on."""
         forks = {r.name: WorldEntry(*_fields(r)) for r in recovered.worlds if r.source}
         dropped = {record.name: record for record in recovered.dropped}
@@ -165,7 +165,7 @@ class WorldJudge:
                 self._observed.count("forks found after a crash", 1)
                 self._found(host, world, picture)
 
-    def _found(self, host: ShardHost, world: WorldEntry, picture: Picture) -> None:
+    def _found(self, host: ShardNode, world: WorldEntry, picture: ShardPicture) -> None:
         """A fork that the disk was working on is there after all, but for what is volatile."""
         wanted = _as_of(picture, world)
         for slot, content in host.shard.state.slots.of_context(world.name):
@@ -184,17 +184,17 @@ def _writer(world: WorldEntry) -> str:
     return f"fork {world.name} of {world.source} as of {world.at_ns}"
 
 
-def _on_disk(host: ShardHost) -> Iterable[object]:
+def _on_disk(host: ShardNode) -> Iterable[object]:
     """Yield what no power cut can take any more, the newest first."""
     for persist in reversed(host.disk.log[: host.disk.synced]):
         yield from persist.records
 
 
-def _of_context(picture: Picture, name: str) -> list[tuple[Slot, State]]:
+def _of_context(picture: ShardPicture, name: str) -> list[tuple[Slot, CommittedState]]:
     return [(slot, chain[-1]) for slot, chain in picture.chains.items() if slot.context == name]
 
 
-def _as_of(picture: Picture, world: WorldEntry) -> dict[Slot, State]:
+def _as_of(picture: ShardPicture, world: WorldEntry) -> dict[Slot, CommittedState]:
     """Return what a fork is to show, by its own slots."""
     return {
         slot._replace(context=world.name): picture.at(slot, world.at_ns)

@@ -14,7 +14,7 @@ from enact_dist.core.protocol.datum import Slot
 from enact_dist.core.protocol.messages import AwaitStamp, Reached, Survey, Surveyed
 from enact_dist.core.protocol.placement import shard_of
 from enact_dist.terms import Access
-from enact_dist.verify.simulation.hosts.client_host import Calls, ClientHost, Steps
+from enact_dist.verify.simulation.hosts.client_host import ClientNode, ParallelCalls, Steps
 from enact_dist.verify.simulation.hosts.world import MS
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from random import Random
 
     from enact_dist.core.protocol.messages import Item
-    from enact_dist.verify.simulation.hosts.world import World
+    from enact_dist.verify.simulation.hosts.world import SimulatedWorld
     from enact_dist.verify.simulation.judges.model import Model
 
 TICK_NS: Final = 1500 * MS
@@ -41,11 +41,11 @@ def drawn_stamp_ns(luck: Random, now_ns: int) -> int:
 class Captures:
     """Finds the newest set of some slots."""
 
-    def __init__(self, world: World, model: Model) -> None:
+    def __init__(self, world: SimulatedWorld, model: Model) -> None:
         self._world, self._model = world, model
 
     def stamped(
-        self, host: ClientHost, items: tuple[Item, ...], luck: Random
+        self, host: ClientNode, items: tuple[Item, ...], luck: Random
     ) -> Steps[tuple[Item, ...]]:
         """Return the items, the views among them with the stamp of their newest set.
 
@@ -64,7 +64,7 @@ class Captures:
         )
 
     def _versions(
-        self, host: ClientHost, slots: Iterable[Slot]
+        self, host: ClientNode, slots: Iterable[Slot]
     ) -> Steps[dict[Slot, list[Capture]]]:
         """Return the retained versions of each slot, as far as its shard tells them."""
         found: dict[Slot, list[Capture]] = {slot: [] for slot in slots}
@@ -78,7 +78,7 @@ class Captures:
             own = dict(host.own)
             if not (yield from self._settled(host, shard)):
                 continue
-            (answer,) = yield Calls([(shard, message)])
+            (answer,) = yield ParallelCalls([(shard, message)])
             if not isinstance(answer, Surveyed):
                 continue
             self._model.of_clients.surveyed(host, own, shard, answer)
@@ -89,7 +89,7 @@ class Captures:
                     found[state.slot].append(version)
         return found
 
-    def _settled(self, host: ClientHost, shard: str) -> Steps[bool]:
+    def _settled(self, host: ClientNode, shard: str) -> Steps[bool]:
         """Wait until a shard shows this process's own commits, for a while."""
         for _ in range(10):
             stamp_ns = host.client.unsettled_ns(shard)
@@ -98,7 +98,7 @@ class Captures:
             self._world.tally["surveys that waited"] += 1
             session, epoch = host.client.session, host.client.epoch(shard)
             question = AwaitStamp(stamp_ns, SLICE_NS, session, epoch)
-            (answer,) = yield Calls([(shard, question)])
+            (answer,) = yield ParallelCalls([(shard, question)])
             if isinstance(answer, Reached) and answer.reached:
                 host.client.reached(shard, stamp_ns)
                 return True

@@ -24,7 +24,7 @@ from enact_dist.core.protocol.messages import (
 )
 from enact_dist.terms import Access
 from enact_dist.verify.simulation.cells import CONTEXTS
-from enact_dist.verify.simulation.hosts.client_host import Calls, Sleep, Steps
+from enact_dist.verify.simulation.hosts.client_host import ParallelCalls, Sleep, Steps
 from enact_dist.verify.simulation.hosts.world import MS, S
 from enact_dist.verify.simulation.work.workload import ENTITIES, PLAIN, Job
 
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from enact_dist.core.protocol.messages import Answer, Request
-    from enact_dist.verify.simulation.hosts.client_host import ClientHost, Thread
-    from enact_dist.verify.simulation.hosts.world import World
+    from enact_dist.verify.simulation.hosts.client_host import ClientNode, Thread
+    from enact_dist.verify.simulation.hosts.world import SimulatedWorld
     from enact_dist.verify.simulation.judges.model import Model
     from enact_dist.verify.simulation.work.workload import Workload
 
@@ -56,14 +56,14 @@ _AGO_NS: Final = (0, 0, 0, 0, 50 * MS, 500 * MS)
 class Forker:
     """Forks and drops world contexts, and lets the workload loose in them."""
 
-    def __init__(self, world: World, model: Model, workload: Workload) -> None:
+    def __init__(self, world: SimulatedWorld, model: Model, workload: Workload) -> None:
         self._world, self._model, self._workload = world, model, workload
         self._unclear: dict[str, None] = {}
         self._sent: dict[str, list[tuple[str, Request]]] = {}
         self._newest_ns = 0
         self.takes_place = world.schedule.stream("forks").random() < SHARE
 
-    def thread(self, host: ClientHost, lane: int) -> Thread:
+    def thread(self, host: ClientNode, lane: int) -> Thread:
         """Fork, work and drop until the run winds down."""
         luck = self._world.schedule.stream(f"forks of {host.name}")
         sources: list[str] = [*CONTEXTS]
@@ -88,11 +88,11 @@ class Forker:
 
     # ---------------------------------------------------------------- one context
 
-    def _fork(self, host: ClientHost, name: str, source: str, luck: Random) -> Steps[bool]:
+    def _fork(self, host: ClientNode, name: str, source: str, luck: Random) -> Steps[bool]:
         """Fork on every shard; a fork that some cannot make is dropped again."""
         shards = [shard.name for shard in host.client.placement.shards]
         self._check_gone(name)
-        present = yield Calls([(shard, AwaitStamp(0, 0)) for shard in shards])
+        present = yield ParallelCalls([(shard, AwaitStamp(0, 0)) for shard in shards])
         stamps = [answer.stamp_ns for answer in present if isinstance(answer, Reached)]
         at_ns = max((host.client.seen_stamp_ns, *stamps)) - luck.choice(_AGO_NS)
         at_ns = self._newest_ns = max(at_ns, self._newest_ns + 1)
@@ -119,7 +119,7 @@ class Forker:
         yield from self._drop(host, name, luck)
         return False
 
-    def _drop(self, host: ClientHost, name: str, luck: Random) -> Steps[None]:
+    def _drop(self, host: ClientNode, name: str, luck: Random) -> Steps[None]:
         session = host.client.session
 
         def drop(epoch: int, count: int) -> DropWorld:
@@ -134,7 +134,7 @@ class Forker:
             del self._unclear[name]
 
     def _drop_in_use(
-        self, host: ClientHost, lane: int, name: str, job: str, luck: Random
+        self, host: ClientNode, lane: int, name: str, job: str, luck: Random
     ) -> Thread:
         """Ask for the end of a context, in some cases, while a lock is held in it."""
         if luck.random() >= IN_USE:
@@ -145,7 +145,7 @@ class Forker:
             for shard in client.placement.shards:
                 count = client.sendings.next(host.local_ns)
                 request = DropWorld(client.session, name, client.epoch(shard.name), count)
-                (answer,) = yield Calls([(shard.name, request)])
+                (answer,) = yield ParallelCalls([(shard.name, request)])
                 held = isinstance(answer, Refused) and answer.code == "held"
                 self._world.tally["drops refused for a lock"] += held
 
@@ -153,12 +153,12 @@ class Forker:
         reads = Job(job, "read", (item,), luck, 2 * S, 60 * S, 0, False, False, meanwhile=drops)
         yield from self._workload.do(host, lane, reads)
 
-    def _late_copy(self, host: ClientHost, luck: Random) -> Thread:
+    def _late_copy(self, host: ClientNode, luck: Random) -> Thread:
         """Let a copy of an earlier request come late, sometimes; no thread awaits its answer."""
         sent = self._sent.get(host.name, [])
         if sent and luck.random() < LATE:
             self._world.tally["copies of forks and drops that came late"] += 1
-            yield Calls([luck.choice(sent)])
+            yield ParallelCalls([luck.choice(sent)])
 
     def _check_gone(self, name: str) -> None:
         """What was dropped on every shard has not come back by itself."""
@@ -166,13 +166,13 @@ class Forker:
             if name in picture.worlds:
                 self._world.violation("late copies make no context", shard, name)
 
-    def _asked(self, host: ClientHost, shard: str, make: _Make, luck: Random) -> _Answered:
+    def _asked(self, host: ClientNode, shard: str, make: _Make, luck: Random) -> _Answered:
         """Ask a shard until it has done it, or says for good why not; None: it never answered."""
         client = host.client
         for _ in range(TRIES):
             if client.needs_hello(shard):
                 hello = client.hello(shard)
-                (answer,) = yield Calls([(shard, hello)])
+                (answer,) = yield ParallelCalls([(shard, hello)])
                 if answer is not None:
                     client.answered(shard, hello, answer, host.local_ns)
                 continue
@@ -180,7 +180,7 @@ class Forker:
             self._sent.setdefault(host.name, []).append((shard, request))
             answer = None
             for _ in range(luck.choice((1, 2, 3))):
-                (answer,) = yield Calls([(shard, request)])
+                (answer,) = yield ParallelCalls([(shard, request)])
                 if answer is not None:
                     break
             if isinstance(answer, EpochChanged):

@@ -18,7 +18,7 @@ from enact_dist.core.protocol.messages import AspectEntry, Refused, Register, Re
 from enact_dist.core.protocol.placement import shard_of
 from enact_dist.core.shard.on_lock import NEWER_TYPE
 from enact_dist.terms import Access
-from enact_dist.verify.simulation.hosts.client_host import Calls, ClientHost, Sleep, Steps
+from enact_dist.verify.simulation.hosts.client_host import ClientNode, ParallelCalls, Sleep, Steps
 from enact_dist.verify.simulation.hosts.world import MS, S
 from enact_dist.verify.simulation.judges.growth import NEWER, NEWER_ENCODING, OLDER
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from enact_dist.core.client.lock import MultiLock
     from enact_dist.core.protocol.datum import Datum, Slot
     from enact_dist.core.protocol.messages import Item
-    from enact_dist.verify.simulation.hosts.world import World
+    from enact_dist.verify.simulation.hosts.world import SimulatedWorld
     from enact_dist.verify.simulation.judges.model import Model
 
 SHARE: Final = 0.4
@@ -47,7 +47,7 @@ REFUSED_NS: Final = 100 * MS
 class Growth:
     """Which process has which program, and what its client compares."""
 
-    def __init__(self, world: World, model: Model, aspects: Iterable[AspectEntry]) -> None:
+    def __init__(self, world: SimulatedWorld, model: Model, aspects: Iterable[AspectEntry]) -> None:
         self._world, self._judge = world, model.growth
         luck = world.schedule.stream("growth")
         self.takes_place = luck.random() < SHARE
@@ -64,7 +64,7 @@ class Growth:
             for entry in aspects
         )
 
-    def written_newer(self, host: ClientHost, items: Iterable[Item]) -> str:
+    def written_newer(self, host: ClientNode, items: Iterable[Item]) -> str:
         """Return the aspect that a job writes with the newer type ("": none)."""
         if not self.takes_place or not self._writes(items):
             return ""
@@ -82,7 +82,7 @@ class Growth:
             self._world.tally["newer data read by older programs"] += of_newer
 
     def compared(
-        self, host: ClientHost, items: Iterable[Item], newer: str, luck: Random
+        self, host: ClientNode, items: Iterable[Item], newer: str, luck: Random
     ) -> Steps[bool]:
         """Let a client compare the type that it would write, as `Session.prepare` does.
 
@@ -107,12 +107,12 @@ class Growth:
                 return False
         return True
 
-    def _asked(self, host: ClientHost, shard: str, entry: AspectEntry) -> Steps[bool]:
+    def _asked(self, host: ClientNode, shard: str, entry: AspectEntry) -> Steps[bool]:
         client, epoch = host.client, host.client.epoch(shard)
         request: Request = client.hello(shard)
         if not client.needs_hello(shard):
             request = Register(client.session, (), (entry,))
-        (answer,) = yield Calls([(shard, request)])
+        (answer,) = yield ParallelCalls([(shard, request)])
         if answer is None:
             yield Sleep(50 * MS)
         elif isinstance(answer, Refused):
@@ -123,14 +123,14 @@ class Growth:
             client.answered(shard, request, answer, host.local_ns)
         return False
 
-    def looks_again(self, host: ClientHost, lock: MultiLock) -> Steps[bool]:
+    def looks_again(self, host: ClientNode, lock: MultiLock) -> Steps[bool]:
         """Greet the shards of a lock that was refused for a newer type; whether it was."""
         if getattr(lock.refusal, "code", "") != NEWER_TYPE:
             return False
         self._world.tally["locks refused for a newer type"] += 1
         for shard in dict.fromkeys(shard for shard, _ in (*lock.plan.locks, *lock.plan.views)):
             hello = host.client.hello(shard)
-            (answer,) = yield Calls([(shard, hello)])
+            (answer,) = yield ParallelCalls([(shard, hello)])
             if answer is not None:
                 host.learn(shard, answer)
                 host.client.answered(shard, hello, answer, host.local_ns)
@@ -140,7 +140,7 @@ class Growth:
         name = self._older.name
         return any(item.aspect == name and Access(item.access).writes for item in items)
 
-    def _shards(self, host: ClientHost, items: Iterable[Item]) -> list[str]:
+    def _shards(self, host: ClientNode, items: Iterable[Item]) -> list[str]:
         placement = host.client.placement
         written = [
             item for item in items if item.aspect == self._older.name and Access(item.access).writes

@@ -12,7 +12,7 @@ from enact_dist.core.client.plan import Phase
 from enact_dist.core.protocol.messages import Item, KeepVersions, ListHistory, SlotVersion, Versions
 from enact_dist.terms import Access
 from enact_dist.verify.simulation.cells import CONTEXTS
-from enact_dist.verify.simulation.hosts.client_host import Calls, Sleep
+from enact_dist.verify.simulation.hosts.client_host import ParallelCalls, Sleep
 from enact_dist.verify.simulation.hosts.world import MS, S
 from enact_dist.verify.simulation.judges.history import Entry
 from enact_dist.verify.simulation.work.workload import ENTITIES, PLAIN
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from random import Random
 
     from enact_dist.core.protocol.messages import VersionEntry
-    from enact_dist.verify.simulation.hosts.client_host import ClientHost, Steps, Thread
-    from enact_dist.verify.simulation.hosts.world import World
-    from enact_dist.verify.simulation.judges.history import History
+    from enact_dist.verify.simulation.hosts.client_host import ClientNode, Steps, Thread
+    from enact_dist.verify.simulation.hosts.world import SimulatedWorld
+    from enact_dist.verify.simulation.judges.history import RunHistory
     from enact_dist.verify.simulation.judges.model import Model
     from enact_dist.verify.simulation.work.workload import Workload
 
@@ -36,12 +36,14 @@ LABELS: Final = 2
 class Historian:
     """Views the past, and adds and removes labels."""
 
-    def __init__(self, world: World, history: History, model: Model, workload: Workload) -> None:
+    def __init__(
+        self, world: SimulatedWorld, history: RunHistory, model: Model, workload: Workload
+    ) -> None:
         self._world, self._history = world, history
         self._model, self._workload = model, workload
         self.takes_place = world.schedule.stream("history").random() < SHARE
 
-    def thread(self, host: ClientHost, lane: int) -> Thread:
+    def thread(self, host: ClientNode, lane: int) -> Thread:
         """Look back until the run winds down."""
         luck = self._world.schedule.stream(f"history of {host.name}")
         number = 0
@@ -58,16 +60,16 @@ class Historian:
                 if self._world.schedule.begins(name):
                     yield from self._looks(host, lane, name, entries, luck)
 
-    def _listed(self, host: ClientHost, shard: str, luck: Random) -> Steps[list[VersionEntry]]:
+    def _listed(self, host: ClientNode, shard: str, luck: Random) -> Steps[list[VersionEntry]]:
         message = ListHistory((luck.choice(CONTEXTS),), (), (luck.choice(PLAIN),))
-        (answer,) = yield Calls([(shard, message)])
+        (answer,) = yield ParallelCalls([(shard, message)])
         found = answer.entries if isinstance(answer, Versions) else ()
         return [entry for entry in found if entry.state.version]
 
     # ---------------------------------------------------------------- views
 
     def _looks(
-        self, host: ClientHost, lane: int, name: str, entries: list[VersionEntry], luck: Random
+        self, host: ClientNode, lane: int, name: str, entries: list[VersionEntry], luck: Random
     ) -> Thread:
         """View some slots of all shards as of one stamp."""
         stamp_ns = luck.choice(entries).state.stamp_ns
@@ -104,7 +106,7 @@ class Historian:
     # ---------------------------------------------------------------- labels
 
     def _keeps(
-        self, host: ClientHost, shard: str, entries: list[VersionEntry], luck: Random
+        self, host: ClientNode, shard: str, entries: list[VersionEntry], luck: Random
     ) -> Thread:
         """Keep one or two versions under a label, or remove the label."""
         client, label = host.client, f"{host.name}/{luck.randrange(LABELS)}"
@@ -113,4 +115,4 @@ class Historian:
         count = client.sendings.next(host.local_ns)
         message = KeepVersions(client.session, label, versions, client.epoch(shard), count)
         for _ in range(luck.choice((1, 1, 2))):
-            yield Calls([(shard, message)])
+            yield ParallelCalls([(shard, message)])

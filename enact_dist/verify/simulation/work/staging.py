@@ -7,7 +7,13 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.datum import Datum
 from enact_dist.core.protocol.messages import Stage, Staged
-from enact_dist.verify.simulation.hosts.client_host import Calls, ClientHost, Sleep, Steps, Thread
+from enact_dist.verify.simulation.hosts.client_host import (
+    ClientNode,
+    ParallelCalls,
+    Sleep,
+    Steps,
+    Thread,
+)
 from enact_dist.verify.simulation.hosts.payloads import DRAFT_NS
 from enact_dist.wire.limits import PAYLOAD_BYTES_MIN
 
@@ -15,7 +21,7 @@ if TYPE_CHECKING:
     from random import Random
 
     from enact_dist.core.protocol.messages import WriteItem
-    from enact_dist.verify.simulation.hosts.world import World
+    from enact_dist.verify.simulation.hosts.world import SimulatedWorld
 
 SLICES: Final = 3
 TRIES: Final = 8
@@ -26,13 +32,13 @@ RARE_NS: Final = DRAFT_NS * 2 // 3
 class Stager:
     """Brings large data to their shards before their commit."""
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: SimulatedWorld) -> None:
         self._world = world
         self._made = 0
 
     def staged(
         self,
-        host: ClientHost,
+        host: ClientNode,
         shard: str,
         writes: list[WriteItem],
         luck: Random,
@@ -60,18 +66,18 @@ class Stager:
             found.append(write._replace(datum=replace(datum, file=file)) if named else write)
         return found
 
-    def _new_name(self, host: ClientHost) -> str:
+    def _new_name(self, host: ClientNode) -> str:
         self._made += 1
         return f"{host.client.session}-{self._made:x}"
 
-    def given_up(self, host: ClientHost, shard: str, datum: Datum) -> Thread:
+    def given_up(self, host: ClientNode, shard: str, datum: Datum) -> Thread:
         """Send two slices with a long time between them, and nothing more, under no lock."""
         file = self._new_name(host)
         yield from self._stage(host, shard, file, datum, tries=2, rests_ns=RARE_NS)
 
     def _stage(
         self,
-        host: ClientHost,
+        host: ClientNode,
         shard: str,
         file: str,
         datum: Datum,
@@ -87,7 +93,7 @@ class Stager:
             here = datum.body[have : have + step]
             part = Datum(b"", here, len(here))
             stage = Stage(host.client.session, file, have, datum.size, part)
-            (answer,) = yield Calls([(shard, stage)])
+            (answer,) = yield ParallelCalls([(shard, stage)])
             if isinstance(answer, Staged):
                 have = answer.have
             elif answer is not None:

@@ -26,12 +26,18 @@ from enact_dist.core.protocol.placement import shard_of
 from enact_dist.terms import Access
 from enact_dist.verify.simulation.cells import CONTEXTS
 from enact_dist.verify.simulation.data import datum_of, label_of, value_of
-from enact_dist.verify.simulation.hosts.client_host import Calls, ClientHost, Sleep, Steps, Thread
+from enact_dist.verify.simulation.hosts.client_host import (
+    ClientNode,
+    ParallelCalls,
+    Sleep,
+    Steps,
+    Thread,
+)
 from enact_dist.verify.simulation.hosts.payloads import DRAFT_NS
 from enact_dist.verify.simulation.hosts.world import MS, S
 from enact_dist.verify.simulation.judges.causes import reads_of
 from enact_dist.verify.simulation.judges.growth import OLDER
-from enact_dist.verify.simulation.judges.history import Entry, History
+from enact_dist.verify.simulation.judges.history import Entry, RunHistory
 from enact_dist.verify.simulation.work.captures import Captures, drawn_stamp_ns
 from enact_dist.verify.simulation.work.growth import ATTEMPTS_MAX, Growth
 from enact_dist.verify.simulation.work.staging import Stager
@@ -39,7 +45,7 @@ from enact_dist.verify.simulation.work.staging import Stager
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from enact_dist.verify.simulation.hosts.world import World
+    from enact_dist.verify.simulation.hosts.world import SimulatedWorld
     from enact_dist.verify.simulation.judges.model import Model
 
 ASPECTS = (
@@ -99,7 +105,9 @@ class Job:
 class Workload:
     """Draws jobs and does them."""
 
-    def __init__(self, world: World, history: History, model: Model, *, entities: int) -> None:
+    def __init__(
+        self, world: SimulatedWorld, history: RunHistory, model: Model, *, entities: int
+    ) -> None:
         self._world, self._history, self._model = world, history, model
         self._stager = Stager(world)
         self._captures = Captures(world, model)
@@ -218,7 +226,7 @@ class Workload:
         views = (view for view in self._view_set(random) if view[1:4] != made[1:4])
         return (made, *views)
 
-    def lingering(self, host: ClientHost) -> tuple[Thread, Thread]:
+    def lingering(self, host: ClientNode) -> tuple[Thread, Thread]:
         """Return two threads: one takes its time for a large datum, one gives a draft up."""
         entity = self._entities[0]
         item = Item(Access.WRITE, "online", entity, "frame")
@@ -231,13 +239,13 @@ class Workload:
         gives_up = self._stager.given_up(host, shard, datum_of("never committed", size=LARGE))
         return self._once(host, job), gives_up
 
-    def _once(self, host: ClientHost, job: Job) -> Thread:
+    def _once(self, host: ClientNode, job: Job) -> Thread:
         if self._world.schedule.begins(job.name):
             yield from self.do(host, 0, job)
 
     # ---------------------------------------------------------------- doing
 
-    def thread(self, host: ClientHost, lane: int) -> Thread:
+    def thread(self, host: ClientNode, lane: int) -> Thread:
         """Do one job after the other until the run winds down."""
         schedule, number = self._world.schedule, 0
         random = schedule.stream(f"work of {host.name} in lane {lane}")
@@ -251,7 +259,7 @@ class Workload:
                 yield Sleep(job.work_ns + MS)
 
     def do(
-        self, host: ClientHost, lane: int, job: Job, *, lock_views: bool = False, attempt: int = 1
+        self, host: ClientNode, lane: int, job: Job, *, lock_views: bool = False, attempt: int = 1
     ) -> Thread:
         """Do one job under one lock; where its views were of no moment, again with them locked."""
         client, growth = host.client, self.growth
@@ -301,7 +309,7 @@ class Workload:
             yield from self.do(host, lane, job, lock_views=lock_views, attempt=attempt + 1)
 
     @staticmethod
-    def _with_known(host: ClientHost, item: Item) -> Item:
+    def _with_known(host: ClientNode, item: Item) -> Item:
         """Say which version the client still has, as `link.client.fetch` does."""
         slot = Slot(item.context, item.entity, item.aspect)
         known = host.cache.get(slot)
@@ -313,7 +321,7 @@ class Workload:
 
     # ---------------------------------------------------------------- reading
 
-    def data(self, host: ClientHost, lock: MultiLock) -> Steps[dict[Slot, Datum | None] | None]:
+    def data(self, host: ClientNode, lock: MultiLock) -> Steps[dict[Slot, Datum | None] | None]:
         """Return the datum of each slot read, fetching what did not come with the grant."""
         data: dict[Slot, Datum | None] = {}
         for reading in lock.states:
@@ -335,11 +343,11 @@ class Workload:
                 host.cache[state.slot] = (reading.shard, reading.epoch, state.version, datum)
         return data
 
-    def _fetched(self, host: ClientHost, lock: MultiLock, reading: Reading) -> Steps[Datum | None]:
+    def _fetched(self, host: ClientNode, lock: MultiLock, reading: Reading) -> Steps[Datum | None]:
         state = reading.state
         request = Fetch(lock.lock, reading.epoch, state.slot, state.version, 0, 1 << 20)
         for _ in range(5):
-            (answer,) = yield Calls([(reading.shard, request)])
+            (answer,) = yield ParallelCalls([(reading.shard, request)])
             if isinstance(answer, Slice):
                 self._world.tally["data fetched"] += 1
                 stamp_ns, encoding = answer.stamp_ns, answer.encoding
@@ -353,7 +361,7 @@ class Workload:
     # ---------------------------------------------------------------- writing
 
     def _finish(
-        self, host: ClientHost, entry: Entry, job: Job, data: dict[Slot, Datum | None]
+        self, host: ClientNode, entry: Entry, job: Job, data: dict[Slot, Datum | None]
     ) -> Thread:
         lock = entry.lock
         writes: dict[str, list[WriteItem]] = {}
