@@ -6,6 +6,7 @@ import os
 import secrets
 import socket
 import sys
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -36,6 +37,7 @@ def connect(
     timeout_s: float = 5.0,
     request_timeout_s: float = 10.0,
     observer: bool = False,
+    patience_s: float | None = None,
 ) -> Cell:
     """Join a running cell.
 
@@ -49,6 +51,7 @@ def connect(
             as long as it takes to learn its outcome.
         observer: Read only: no lock can be taken, no world context or aspect is created, and
             shards keep no record of the session.
+        patience_s: The former name of `request_timeout_s`, for this release.
 
     Raises:
         ShardUnreachableError: No shard answered in time; the message names shards and endpoints.
@@ -60,6 +63,13 @@ def connect(
     from enact_dist.link.client.joining import join
     from enact_dist.link.zenoh.config import OPEN_S
 
+    if patience_s is not None:
+        warnings.warn(
+            "connect(patience_s=…) is now connect(request_timeout_s=…)",
+            DeprecationWarning,
+            stacklevel=2,
+        )
+        request_timeout_s = patience_s
     for word, waits_s in (("timeout_s", timeout_s), ("request_timeout_s", request_timeout_s)):
         check_seconds(word, waits_s)
     name, ttl_s = "", TTL_S

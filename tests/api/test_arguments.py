@@ -130,3 +130,12 @@ def test_seconds_may_be_any_number(online):
     for wait_s in (1, 0.5, np.float32(0.5), np.int64(1), float("inf")):
         with Lock(Write(online, robot, PLAN), wait_s=wait_s) as lock:
             lock[Write(online, robot, PLAN)] = {}
+
+
+def test_former_name_of_the_time_limit_of_requests_still_counts():
+    """For one release; the warning names the new one."""
+    with (
+        pytest.warns(DeprecationWarning, match=r"connect\(request_timeout_s=…\)"),
+        pytest.raises(MisuseError, match="request_timeout_s is -1"),
+    ):
+        connect("tcp/127.0.0.1:1", patience_s=-1)
