@@ -44,7 +44,7 @@ MODULES_MAX = 12
 MODULES_MAX_OF = {"cli": 16, "wire": 16}
 FULL_FOLDERS: dict[str, int] = {
     "core/shard": 16,
-    "core/state": 15,
+    "core/state": 14,
 }
 """Folders with more modules, and with how many."""
 DEFINED_AGAIN: dict[str, int] = {
@@ -54,8 +54,8 @@ DEFINED_AGAIN: dict[str, int] = {
 """Public classes of one name, and how many there are."""
 PURE = {
     "core": {
-        "__future__", "array", "bisect", "collections", "dataclasses", "enum", "hashlib", "heapq",
-        "itertools", "operator", "typing",
+        "__future__", "array", "bisect", "collections", "dataclasses", "enum", "functools", "hashlib",
+        "heapq", "itertools", "operator", "typing",
     },
     "wire": {
         "__future__", "collections", "dataclasses", "enum", "functools", "hashlib", "itertools",

@@ -24,7 +24,6 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections import deque
 from contextlib import ExitStack
 from threading import get_ident
 from typing import TYPE_CHECKING, Final, cast
@@ -169,7 +168,6 @@ class ShardHost:
         self._uninterrupted = Uninterrupted()
         self._replies: dict[int, Callable[[Answer], None]] = {}
         self._handles = 0
-        self._kept_at_once: deque[int] = deque()
         self._watchers: tuple[Callable[[Notice], None], ...] = ()
         self._call: Callable[[str, Request], None] | None = None
         self._compare: Callable[[Compare], None] = lambda _: None
@@ -183,6 +181,8 @@ class ShardHost:
         self._wake = threading.Condition(threading.Lock())
         self._look_again = False
         self._store = store
+        if store is None:
+            shard.keep_nothing()
         self._store_thread = self._start_store(store) if store is not None else None
         self._stalls = Stalls(self.name, self.count)
         self._timer = threading.Thread(target=self._keep_time, name="enact-timer", daemon=True)
@@ -360,8 +360,6 @@ class ShardHost:
                     self._perform(effect)
             for told in later:
                 self._tell(told)
-            while self._kept_at_once:
-                self._handle_now(Persisted(self._kept_at_once.popleft()), 0, "")
             if self._draining and self._shard.idle:
                 self._rests.set()
         except BaseException as failure:
@@ -392,8 +390,6 @@ class ShardHost:
     def _persist(self, effect: Persist) -> None:
         if self._store_thread is not None:
             self._store_thread.submit(effect)
-        elif effect.ticket:
-            self._kept_at_once.append(effect.ticket)
 
     def _persisted(self, tickets: list[int]) -> None:
         """Report to the shard that these tickets are stored."""

@@ -84,7 +84,7 @@ def _tells_early(patch, method, answer):
     def wrong(self, *arguments):
         for effect in wrapped(self, *arguments):
             if isinstance(effect, Persist):
-                work = self._at_store[effect.ticket]
+                work = next(reversed(self._at_store.values()))
                 replies, work.replies = work.replies, []
                 yield from (Reply(reply_to, answer(work.record)) for reply_to in replies)
             yield effect
@@ -241,11 +241,11 @@ def welcomes_early(patch):
     """A session is welcomed before its record is on disk."""
     answer_when_durable = SessionDesk.answer_when_durable
 
-    def wrong(self, reply_to, answer, records, *durability):
-        for effect in answer_when_durable(self, reply_to, answer, records, *durability):
+    def wrong(self, reply_to, answer, records, *durability, **options):
+        for effect in answer_when_durable(self, reply_to, answer, records, *durability, **options):
             yield effect
             if isinstance(effect, Persist):
-                yield Reply(*self._answers_after[effect.ticket].pop())
+                yield next(reversed(self._unanswered.values())).pop()
 
     patch(SessionDesk, "answer_when_durable", wrong)
 

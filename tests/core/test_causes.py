@@ -24,8 +24,8 @@ from enact_dist.core.protocol.messages import (
 )
 from enact_dist.core.protocol.pages import PAGE_BYTES_MAX
 from enact_dist.core.protocol.parts import READS_MAX
+from enact_dist.core.protocol.records import READ_BYTES
 from enact_dist.core.shard.on_history import bytes_of
-from enact_dist.core.state.causes import READ_BYTES
 from enact_dist.terms import Access
 from enact_dist.wire.frames import encode_frame
 

@@ -8,7 +8,15 @@ import pytest
 from prepare_parts import FAR_TOKEN
 from shard_bench import MS, S, ShardBench, item, lock_id, slot
 
-from enact_dist.core.protocol.messages import Commit, Goodbye, Granted, Prepare, Release, WriteItem
+from enact_dist.core.protocol.messages import (
+    Commit,
+    Goodbye,
+    Granted,
+    Ping,
+    Prepare,
+    Release,
+    WriteItem,
+)
 from enact_dist.core.protocol.records import SessionSeen, Tick
 from enact_dist.core.state.due_times import STALE_MAX, DueTimes
 from enact_dist.core.state.sessions import IDLE_TTLS, Session
@@ -95,7 +103,7 @@ def test_tick_finds_what_a_look_at_every_session_would_find(seed):
         step_ns = 2 * S if random.random() < 0.01 else random.choice((0, 50 * MS, 95 * MS, 95 * MS))
         bench.now_ns += step_ns
         bench.wall_ns += step_ns
-        bench.shard._advance(bench.now_ns, bench.wall_ns)  # a stall moves the ends
+        bench.ask(Ping())  # a stall moves the ends
         over, idle = walked(bench)
         state = bench.shard.state
 

@@ -211,10 +211,11 @@ def skips_validation(patch: Patch) -> None:
 def welcomes_early(patch: Patch) -> None:
     """Welcome and Registered do not wait for the disk."""
 
-    def wrong(self: SessionDesk, reply_to: int, answer: Any, records: Any, *_: Any) -> Any:
+    def wrong(
+        self: SessionDesk, reply_to: int, answer: Any, records: Any, *_: Any, **_options: Any
+    ) -> Any:
         for session in self._state.sessions:
             session.present = session.durable = True
-        self._ticket -= 1
         yield Reply(reply_to, answer)
         if records:
             yield Persist(0, records, Durability.DURABLE)

@@ -39,7 +39,7 @@ def promises_before_it_is_kept(patch: Patch) -> None:
     def wrong(self: PrepareDesk, message: Any, reply_to: int) -> Any:
         for effect in on_prepare(self, message, reply_to):
             if isinstance(effect, Persist):
-                work = self._at_store[effect.ticket]
+                work = self._at_store[message.lock]
                 replies, work.replies = work.replies, []
                 for reply in replies:
                     yield Reply(reply, prepares._prepared(work.record))
@@ -117,7 +117,7 @@ def promises_may_be_lost(patch: Patch) -> None:
     persist = PrepareDesk._persist
 
     def wrong(self: PrepareDesk, work: Any, records: Any) -> Any:
-        return replace(persist(self, work, records), durability=Durability.OS)
+        return [replace(one, durability=Durability.OS) for one in persist(self, work, records)]
 
     patch(PrepareDesk, "_persist", wrong)
 

@@ -65,9 +65,9 @@ def counts_a_set_from_its_capture(patch: Patch) -> None:
     """A view by stamp claims to be current from the commit of the old version that it shows."""
     shown = SlotMap.shown
 
-    def wrong(self: SlotMap, items: Any, at_ns: int = 0) -> Shown:
+    def wrong(self: SlotMap, items: Any, at_ns: int = 0, **options: Any) -> Shown:
         items = tuple(items)
-        right = shown(self, items, at_ns)
+        right = shown(self, items, at_ns, **options)
         if not any(item.captured_ns for item in items):
             return right
         return right._replace(from_ns=max((s.stamp_ns for s in right.states), default=0))
@@ -79,8 +79,8 @@ def forgets_large_data_that_a_stamp_named(patch: Patch) -> None:
     """Only the newest version of a large datum stays fetchable for the lock that it was shown to."""
     shown = SlotMap.shown
 
-    def wrong(self: SlotMap, items: Any, at_ns: int = 0) -> Shown:
-        right = shown(self, items, at_ns)
+    def wrong(self: SlotMap, items: Any, at_ns: int = 0, **options: Any) -> Shown:
+        right = shown(self, items, at_ns, **options)
         pins = {key: datum for key, datum in right.pins.items() if self[key[0]].version == key[1]}
         return right._replace(pins=pins)
 

@@ -97,7 +97,7 @@ def tells_of_forks_too_early(patch: Patch) -> None:
         for effect in make(self, act):
             if isinstance(effect, Persist):
                 yield replace(effect, ticket=0)
-                yield from self.persisted(effect.ticket)
+                yield from self._state.persisted(effect.ticket)
             else:
                 yield effect
 
@@ -143,18 +143,18 @@ def drops_under_locks(patch: Patch) -> None:
 
 def drops_in_silence(patch: Patch) -> None:
     """Nobody who watches is told that a context has gone."""
-    persisted = WorldDesk.persisted
+    persisted = WorldDesk._persisted
 
-    def wrong(self: WorldDesk, ticket: int) -> Any:
-        commits, drop = self._state.commits, isinstance(self._at_store[ticket].message, DropWorld)
+    def wrong(self: WorldDesk, act: Any, now_ns: int) -> Any:
+        commits, drop = self._state.commits, isinstance(act.message, DropWorld)
         number = commits.notice_number
-        for effect in persisted(self, ticket):
+        for effect in persisted(self, act, now_ns):
             if not (drop and isinstance(effect, Publish)):
                 yield effect
         if drop:
             commits.notice_number = number
 
-    patch(WorldDesk, "persisted", wrong)
+    patch(WorldDesk, "_persisted", wrong)
 
 
 def drops_half_of_it(patch: Patch) -> None:

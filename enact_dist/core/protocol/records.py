@@ -6,6 +6,7 @@ when it survives what its durability promises.  Everything else is decided in th
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -115,19 +116,44 @@ class SlotRecord:
 
 @message
 class Content:
-    """The committed state of one slot; replaced, never changed."""
+    """The committed state of one slot; replaced, never changed.
+
+    `bytes` is what `own_bytes` says of it, or -1 where nobody has counted yet.
+    """
 
     version: int
     stamp_ns: int
     datum: Datum | None
     null_reason: NullReason
     cause: Cause | None = None
+    bytes: int = field(default=-1, compare=False)
 
 
 NOTHING: Final = Content(0, 0, None, NullReason.NEVER_SET)
 """The state of a slot that was never written."""
 LOST: Final = Content(0, 0, None, NullReason.LOST)
 """The state of a volatile slot after a restart of its shard."""
+
+
+READ_BYTES: Final = 400
+"""About what one datum that a cause names takes in memory: its slot, version and stamp."""
+
+
+def cause_bytes(cause: Cause) -> int:
+    """Return about how much memory one of the versions that share a cause takes for it."""
+    return READ_BYTES * len(cause.reads) // max(1, len(cause.writes))
+
+
+def own_bytes(content: Content) -> int:
+    """Return the bytes that a state holds in the memory of the shard alone, lineage included.
+
+    Data that a restart has found in a file are mapped, and read when they are asked for.
+    """
+    if content.bytes >= 0:
+        return content.bytes
+    datum, cause = content.datum, content.cause
+    size = datum.size if datum is not None and not datum.file and datum.fault is None else 0
+    return size if cause is None or not cause.reads else size + cause_bytes(cause)
 
 
 def content_of(record: SlotRecord) -> Content:
@@ -340,6 +366,8 @@ class Story:
 
 
 Effect = Reply | Persist | Publish | Call | Compare | Story
+Then = Callable[[int], Iterable[Effect]]
+"""How the shard goes on once records are kept: the time by then, to further effects."""
 
 
 # ---------------------------------------------------------------- events that are no requests

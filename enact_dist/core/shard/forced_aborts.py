@@ -14,6 +14,7 @@ not pass in silence.  The lost shard may come back after years; asking costs one
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.messages import (
@@ -61,7 +62,7 @@ class ForcedAborts:
         self._state = state
         self._records = {record.lock: record for record in recovered}
         self._ask_ns = dict.fromkeys(self._records, state.now_ns)
-        self._at_store: dict[int, _Ending] = {}
+        self._at_store: dict[LockId, _Ending] = {}
 
     def __contains__(self, lock: LockId) -> bool:
         return lock in self._records
@@ -110,7 +111,7 @@ class ForcedAborts:
 
     def committed(self, lock: LockId, position: Position, replies: list[int]) -> Iterator[Effect]:
         """The lost shard is back and says that it had committed: the commit is torn."""
-        under_way = next((e for e in self._at_store.values() if e.record.lock == lock), None)
+        under_way = self._at_store.get(lock)
         if under_way is not None:
             under_way.replies += replies
             return
@@ -124,19 +125,15 @@ class ForcedAborts:
         )
         self._state.count("forced_but_committed")
         kept = self._state.audit.keep(AuditRecord(self._state.wall_ns, text, ALARM))
-        ticket = self._state.commits.new_ticket()
-        self._at_store[ticket] = _Ending(record, replies)
+        ending = self._at_store[lock] = _Ending(record, replies)
         yield Story("lock.alarm", text, grave=True)
-        yield Persist(ticket, (kept, ForcedEnded(lock)), Durability.DURABLE)
+        then = partial(self._persisted, ending)
+        yield from self._state.persist((kept, ForcedEnded(lock)), Durability.DURABLE, then)
 
-    def is_mine(self, ticket: int) -> bool:
-        """Whether the store was asked to keep an alarm under this number."""
-        return ticket in self._at_store
-
-    def persisted(self, ticket: int) -> Iterator[Effect]:
+    def _persisted(self, ending: _Ending, _: int) -> Iterator[Effect]:
         """The alarm is durable: the shard that decided may forget the lock."""
-        ending = self._at_store.pop(ticket)
-        del self._records[ending.record.lock]
+        lock = ending.record.lock
+        del self._at_store[lock], self._records[lock]
         for reply_to in ending.replies:
             yield Reply(reply_to, Finished(ending.record.lock))
 

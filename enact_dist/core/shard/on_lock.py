@@ -21,8 +21,8 @@ from enact_dist.core.protocol.messages import (
 )
 from enact_dist.core.protocol.records import Effect, Reply
 from enact_dist.core.shard import quotas
-from enact_dist.core.state.grants import SHAPE_ITEMS_MAX, SHAPES_MAX
-from enact_dist.core.state.sessions import LANES_MAX, Session
+from enact_dist.core.state.grants import Shape, shape_of
+from enact_dist.core.state.sessions import LANES_MAX, Lane, Session
 from enact_dist.terms import ACCESSES
 
 if TYPE_CHECKING:
@@ -50,21 +50,23 @@ class LockDesk:
     def __init__(self, state: ShardState, prepares: PrepareDesk) -> None:
         self._state = state
         self._prepares = prepares
-        self._right: set[tuple[Item, ...]] = set()
 
     def on_acquire(self, message: Acquire, reply_to: int) -> Iterable[Effect]:
         """Queue a lock, or continue with one that is already queued or granted."""
-        state, lock = self._state, message.lock
-        session = state.session_in_epoch(lock.session, message.epoch)
-        refusal = self.refused(session, message.map_version, message.items)
-        if refusal is not None or session is None:
-            return [Reply(reply_to, refusal or EpochChanged(state.epoch))]
+        state, lock, items = self._state, message.lock, message.items
+        tenures = state.tenures
+        session = state.sessions.by_id.get(lock.session)
+        if message.epoch != state.epoch or session is None or not session.present:
+            return [Reply(reply_to, state.epoch_changed(message.epoch))]
+        shape = tenures.shapes.get(items)
+        refusal = self.refused(message.map_version, items, shape)
+        if refusal is not None:
+            return [Reply(reply_to, refusal)]
         if session.observer:
             text = "this session only observes and cannot lock; connect without observer=True"
             return [Reply(reply_to, Refused("value", text))]
-        session.renewed_ns = max(session.renewed_ns, state.now_ns)
-        session.count_seen = max(session.count_seen, message.count)
-        tenures, effects = state.tenures, list[Effect]()
+        session.renew(state.now_ns, message.count)
+        effects: list[Effect] = []
         tenure = tenures.by_lock.get(lock)
         if tenure is None:
             refused = self._kept_out(message, session, reply_to)
@@ -72,14 +74,18 @@ class LockDesk:
                 return refused
             if lock.session in tenures.by_session or state.pins.by_session:
                 effects += self._supersede(lock)
-            session.lane(lock.lane).top = lock.seq
-            tenure = tenures.enqueue(message, now_ns=state.now_ns, at_once=state.grants)
+            session.lanes[lock.lane].top = lock.seq
+            if shape is None:
+                shape = tenures.shapes.get(items) or shape_of(items)
+            tenure = tenures.enqueue(
+                message, shape, session, now_ns=state.now_ns, at_once=state.grants
+            )
             if tenures.table.ready:
                 effects += state.grant_ready()
         if tenure.token is not None:
-            stamp_ns = state.stamp(message.seen_stamp_ns)
+            stamp_ns = state.stamps.now(wall_ns=state.wall_ns, seen_ns=message.seen_stamp_ns)
             granted = tenures.granted(tenure, now_ns=state.now_ns, stamp_ns=stamp_ns)
-            effects.append(Reply(reply_to, granted))
+            effects += (Reply(reply_to, granted),)
         else:
             state.count("lock_waits")
             effects += tenures.park(
@@ -90,29 +96,30 @@ class LockDesk:
     def _kept_out(
         self, message: Acquire, session: Session, reply_to: int
     ) -> Iterable[Effect] | None:
-        """Return why a new lock gets no place in the queue, None if it gets one."""
+        """Return why a new lock gets no place in the queue, None if it gets one in its lane."""
         state, lock = self._state, message.lock
         if message.successions != state.catalogue.successions:  # not the usual case
             missed = self._missed_type(message)
             if missed is not None:
                 state.count("newer_types_missed")
                 return [Reply(reply_to, missed)]
-        lane = session.lanes.get(lock.lane)
-        if lane is None:
-            if len(session.lanes) >= LANES_MAX:
+        lanes, tenures = session.lanes, state.tenures
+        if lock.lane not in lanes:
+            if len(lanes) >= LANES_MAX:
                 return [Reply(reply_to, Refused("overload", f"{LANES_MAX} lanes in one session"))]
-        elif lock.seq <= lane.top:
+        elif lock.seq <= lanes[lock.lane].top:
             state.count("stale")
             return [Reply(reply_to, Stale(lock, state.epoch))]
-        tenures = state.tenures
         if len(tenures.by_lock) >= quotas.WAITERS_MAX and self._has_its_share(session):
             bound = f"{quotas.WAITERS_MAX} locks held or awaited"
             return state.quotas.refuse(reply_to, session.identity, bound)
-        if session.identity and (
-            tenures.items_waiting(session.identity) >= quotas.ITEMS_WAITING_MAX
+        if session.identity and tenures.waiting_of.get(session.identity, 0) >= (
+            quotas.ITEMS_WAITING_MAX
         ):
             bound = f"{quotas.ITEMS_WAITING_MAX} requests in locks that wait"
             return state.quotas.refuse(reply_to, session.identity, bound)
+        if lock.lane not in lanes:
+            lanes[lock.lane] = Lane()
         return None
 
     def _missed_type(self, message: Acquire) -> Refused | None:
@@ -146,24 +153,29 @@ class LockDesk:
         self._state.pins.drop_older(lock.session, {lock.lane: lock.seq})
 
     def refused(
-        self, session: Session | None, map_version: int, items: tuple[Item, ...]
+        self, map_version: int, items: tuple[Item, ...], shape: Shape | None
     ) -> Answer | None:
-        """Return why this shard cannot grant these items, None if it can."""
-        if session is None:
-            return EpochChanged(self._state.epoch)
-        if map_version != self._state.settings.placement.version:
-            self._state.count("wrong_shard")
-            return WrongShard(self._state.settings.placement)
-        if len(items) > ITEMS_MAX:
-            return Refused("value", f"{len(items)} requests in one lock; at most {ITEMS_MAX}")
-        if len(self._state.tenures.by_lock) >= LOCKS_MAX:
+        """Return why this shard cannot grant these items, None if it can.
+
+        Args:
+            map_version: The placement that the client knows.
+            items: What it asks for.
+            shape: What is remembered of these items, if anything is.
+        """
+        state = self._state
+        if map_version != state.settings.placement.version:
+            state.count("wrong_shard")
+            return WrongShard(state.settings.placement)
+        if len(state.tenures.by_lock) >= LOCKS_MAX:
             return Refused("overload", f"{LOCKS_MAX} locks are held or awaited here")
-        if items not in self._right:
+        if shape is None or shape.patterns > 1:
+            if len(items) > ITEMS_MAX:
+                return Refused("value", f"{len(items)} requests in one lock; at most {ITEMS_MAX}")
             wrong = wrong_access(items) or self._too_much_to_look_at(items)
             if wrong is not None:
                 return wrong
-            self._note_right(items)
-        worlds, aspects = self._state.catalogue.worlds, self._state.catalogue.aspects
+            state.tenures.remember(items)
+        worlds, aspects = state.catalogue.worlds, state.catalogue.aspects
         for item in items:
             if item.context not in worlds:
                 return unknown_world(item.context, worlds)
@@ -171,14 +183,6 @@ class LockDesk:
                 # Reading an unregistered aspect is no fault: its slots are null.
                 return Refused("unknown_aspect", f"aspect {item.aspect!r} is not registered here")
         return None
-
-    def _note_right(self, items: tuple[Item, ...]) -> None:
-        """Remember a set of requests with nothing wrong in it, whatever slots there are."""
-        patterns = sum(ACCESSES[item.access].each for item in items)
-        if patterns <= 1 and len(items) <= SHAPE_ITEMS_MAX:
-            if len(self._right) >= SHAPES_MAX:
-                self._right.clear()
-            self._right.add(items)
 
     def _too_much_to_look_at(self, items: tuple[Item, ...]) -> Refused | None:
         """Refuse many patterns over many slots: everybody else waits while they are matched."""
@@ -234,15 +238,19 @@ class LockDesk:
         content = self._state.slots[message.slot]
         return content.datum if content.version == message.version else None
 
-    def on_release(self, message: Release, reply_to: int) -> Iterator[Effect]:
+    def on_release(self, message: Release, reply_to: int) -> Iterable[Effect]:
         """Give up a lock, its place and its pins; always answered."""
-        tenure = self._state.tenures.by_lock.get(message.lock)
+        state, lock = self._state, message.lock
+        tenure = state.tenures.by_lock.get(lock)
+        effects: list[Effect] = []
         if tenure is not None and not tenure.bound:
-            yield from self._state.tenures.remove(tenure, now_ns=self._state.now_ns)
+            effects += state.tenures.remove(tenure, now_ns=state.now_ns)
         elif tenure is not None:
-            self._prepares.hint(message.lock)
-        self._state.pins.drop(message.lock)
-        yield Reply(reply_to, Released())
+            self._prepares.hint(lock)
+        if lock.session in state.pins.by_session:
+            state.pins.drop(lock)
+        effects += (Reply(reply_to, Released()),)
+        return effects
 
 
 def _damaged(message: Fetch, fault: str) -> Refused:

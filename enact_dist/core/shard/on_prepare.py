@@ -22,6 +22,7 @@ Rules a change must keep
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Final, cast
 
 from enact_dist.core.protocol.checks import wrong_finish
@@ -57,13 +58,13 @@ from enact_dist.core.protocol.records import (
 )
 from enact_dist.core.shard.forced_aborts import ForcedAborts
 from enact_dist.core.state.audit import FORCED
-from enact_dist.core.state.causes import cause_of, decided_cause
 from enact_dist.core.state.clock import wrong_decision
 from enact_dist.terms import Durability
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterable, Iterator
 
+    from enact_dist.core.protocol.messages import Cause
     from enact_dist.core.protocol.records import ShardReturned
     from enact_dist.core.shard.state import ShardState
     from enact_dist.core.state.grants import Tenure
@@ -103,16 +104,14 @@ class PrepareDesk:
         forced: Iterable[ForcedRecord] = (),
     ) -> None:
         self._state = state
-        self._at_store: dict[int, _AtStore] = {}
+        self._at_store: dict[LockId, _AtStore] = {}
         self._ask_ns: dict[LockId, int] = {}
         self._refused: set[LockId] = set()
         self._forced = ForcedAborts(state, forced)
         for record in recovered:
             # Versions of volatile slots have started again.
-            versions = tuple(
-                SlotVersion(write.slot, state.slots.next_version(write.slot))
-                for write in record.writes
-            )
+            next_version = state.slots.next_version
+            versions = tuple([SlotVersion(slot, next_version(slot)) for slot, _ in record.writes])
             record = replace(record, versions=versions)  # noqa: PLW2901 - the same, as of now
             state.tenures.restore(record, now_ns=state.now_ns)
             state.stamps.saw(record.stamp_ns)
@@ -129,11 +128,12 @@ class PrepareDesk:
             state.count("prepares_repeated")
             yield Reply(reply_to, _prepared(tenure.prepared))
             return
-        under_way = self._at_store_of(message.lock)
+        under_way = self._at_store.get(message.lock)
         if under_way is not None:
             under_way.replies.append(reply_to)
             return
-        refusal = state.commits.refusal(message, tenure, wall_ns=state.wall_ns)
+        new = not state.slots.exist(message.writes)
+        refusal = state.commits.refusal(message, tenure, new=new, wall_ns=state.wall_ns)
         if refusal is not None or tenure is None:
             yield Reply(reply_to, refusal)
             return
@@ -142,12 +142,8 @@ class PrepareDesk:
             yield from state.commits.changed(tenure, moved, reply_to=reply_to, now_ns=state.now_ns)
             return
         stamp_ns = state.stamps.next(seen_ns=message.seen_stamp_ns, wall_ns=state.wall_ns)
-        versions = tuple(
-            [
-                SlotVersion(write.slot, state.slots.next_version(write.slot))
-                for write in message.writes
-            ]
-        )
+        next_version = state.slots.next_version
+        versions = tuple([SlotVersion(slot, next_version(slot)) for slot, _ in message.writes])
         session = state.sessions.by_id[message.lock.session]
         record = PreparedRecord(
             message.lock,
@@ -158,28 +154,21 @@ class PrepareDesk:
             stamp_ns,
             message.primary,
             message.primary_token,
-            cause_of(message, session, versions, stamp_ns, state.now_ns - tenure.granted_ns),
+            session.cause(message, versions, stamp_ns, state.now_ns - tenure.granted_ns),
         )
         state.pins.drop(message.lock)
-        yield self._persist(_AtStore(tenure, record, replies=[reply_to]), (record,))
+        yield from self._persist(_AtStore(tenure, record, replies=[reply_to]), (record,))
 
-    def _persist(self, work: _AtStore, records: tuple[Record, ...]) -> Effect:
+    def _persist(self, work: _AtStore, records: tuple[Record, ...]) -> list[Effect]:
         work.tenure.committing = True
-        ticket = self._state.commits.new_ticket()
-        self._at_store[ticket] = work
-        forgotten = self._state.slots.history.take_forgotten()
-        return Persist(ticket, (*records, *forgotten), Durability.DURABLE)
+        self._at_store[work.record.lock] = work
+        kept = (*records, *self._state.slots.history.take_forgotten())
+        return self._state.persist(kept, Durability.DURABLE, partial(self._persisted, work))
 
-    def _at_store_of(self, lock: LockId) -> _AtStore | None:
-        return next((work for work in self._at_store.values() if work.record.lock == lock), None)
-
-    def persisted(self, ticket: int) -> Iterator[Effect]:
+    def _persisted(self, work: _AtStore, _: int) -> Iterator[Effect]:
         """The store is done with a preparation, or with the end of one."""
-        if self._forced.is_mine(ticket):
-            yield from self._forced.persisted(ticket)
-            return
-        work = self._at_store.pop(ticket)
         tenure, record = work.tenure, work.record
+        del self._at_store[record.lock]
         tenure.committing = False
         if work.forced is not None:
             yield from self._given_up(work, work.forced)
@@ -192,7 +181,7 @@ class PrepareDesk:
                 yield Reply(reply_to, _prepared(record))
             return
         commits = self._state.commits
-        cause = decided_cause(record, stamp_ns=work.stamp_ns)
+        cause = _decided_cause(record, stamp_ns=work.stamp_ns)
         changes = commits.apply_writes(record.writes, record.versions, work.stamp_ns, cause)
         yield from self._end(tenure)
         self._state.count("commits_finished")
@@ -238,7 +227,7 @@ class PrepareDesk:
     def _finish(self, tenure: Tenure, position: Position, replies: list[int]) -> Iterator[Effect]:
         record = tenure.prepared
         assert record is not None
-        under_way = self._at_store_of(record.lock)
+        under_way = self._at_store.get(record.lock)
         if under_way is not None:
             under_way.replies += replies
             under_way.told = position
@@ -246,9 +235,9 @@ class PrepareDesk:
         # Never before the stamp that views know of the lock, whatever its client said elsewhere.
         stamp_ns = max(position.stamp_ns, record.stamp_ns)
         self._state.stamps.saw(stamp_ns)
-        cause = decided_cause(record, stamp_ns=stamp_ns)
+        cause = _decided_cause(record, stamp_ns=stamp_ns)
         written = self._state.commits.records(record.writes, record.versions, stamp_ns, cause)
-        yield self._persist(
+        yield from self._persist(
             _AtStore(tenure, record, stamp_ns, replies), (*written, PreparedEnded(record.lock))
         )
 
@@ -357,7 +346,7 @@ class PrepareDesk:
         tenure = state.numbered(message.number, message.epoch)
         record = tenure.prepared if tenure is not None else None
         if tenure is None or record is None or tenure.committing:
-            under_way = self._at_store_of(tenure.lock) if tenure is not None else None
+            under_way = self._at_store.get(tenure.lock) if tenure is not None else None
             if under_way is not None and under_way.asked == message:
                 under_way.operators.append(reply_to)
             else:
@@ -376,7 +365,7 @@ class PrepareDesk:
         work.operators.append(reply_to)
         audit = state.audit.keep(AuditRecord(state.wall_ns, text, FORCED, state.asker))
         yield Story("lock.forced", text, grave=True)
-        yield self._persist(work, (audit, forced, PreparedEnded(tenure.lock)))
+        yield from self._persist(work, (audit, forced, PreparedEnded(tenure.lock)))
 
     def _given_up(self, work: _AtStore, forced: ForcedRecord) -> Iterator[Effect]:
         """An abort by hand is durable: free the slots, and go on asking the lost shard."""
@@ -402,3 +391,10 @@ class PrepareDesk:
 
 def _prepared(record: PreparedRecord) -> Prepared:
     return Prepared(record.lock, record.stamp_ns, record.versions)
+
+
+def _decided_cause(record: PreparedRecord, *, stamp_ns: int) -> Cause | None:
+    """Return the cause of what was prepared, now that its stamp and its versions are certain."""
+    if record.cause is None:
+        return None
+    return record.cause._replace(stamp_ns=stamp_ns, writes=record.versions)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.checks import wrong_aspect, wrong_name
@@ -38,28 +39,23 @@ from enact_dist.core.shard.inspection import REPORT_BYTES_MAX
 from enact_dist.terms import Durability
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Iterator
+    from collections.abc import Generator, Iterable, Iterator
 
     from enact_dist.core.shard.state import ShardState
+    from enact_dist.core.state.sessions import Session
 
 TTL_NS_MIN: Final = 100_000_000
 """Leases shorter than this would be lost to ordinary scheduling delays."""
 
 
 class SessionDesk:
-    """Everything about who is alive.  Negative tickets of the store are this desk's own."""
+    """Everything about who is alive."""
 
     def __init__(self, state: ShardState) -> None:
         self._state = state
-        self._answers_after: dict[int, list[tuple[int, Answer]]] = {}
-        self._recording: dict[str, int] = {}
-        self._recorded: dict[int, str] = {}
-        self._ticket = 0
-
-    @property
-    def waits_for_store(self) -> bool:
-        """Whether an answer waits for its record to be durable."""
-        return bool(self._answers_after)
+        self._unanswered: dict[int, list[Reply]] = {}
+        self._recording: dict[str, Session] = {}
+        self._count = 0
 
     def on_hello(self, message: Hello, reply_to: int) -> Iterator[Effect]:
         """Open a session, or take its acknowledgement of this epoch."""
@@ -103,9 +99,8 @@ class SessionDesk:
             # A session that a restart would not know could lose its grants without the grace, so
             # it may do nothing before its record is durable.
             record = SessionRecord(session.session, session.ttl_ns, session.identity)
-            yield from self.answer_when_durable(reply_to, welcome, (record,))
-            self._recording[session.session] = self._ticket
-            self._recorded[self._ticket] = session.session
+            self._recording[session.session] = session
+            yield from self.answer_when_durable(reply_to, welcome, (record,), session=session)
         else:
             session.present = session.present or not unrecorded
             yield from self.answer_when_durable(reply_to, welcome, ())
@@ -125,27 +120,34 @@ class SessionDesk:
         answer: Answer,
         records: tuple[Record, ...],
         durability: Durability = Durability.DURABLE,
+        session: Session | None = None,
     ) -> Iterator[Effect]:
-        """Answer when `records` are kept, and all before them that the answer may tell of."""
-        if records:
-            self._ticket -= 1
-            self._answers_after[self._ticket] = [(reply_to, answer)]
-            yield Persist(self._ticket, records, durability)
-        elif self._answers_after:
-            next(reversed(self._answers_after.values())).append((reply_to, answer))
-        else:
-            yield Reply(reply_to, answer)
+        """Answer when `records` are kept, and all before them that the answer may tell of.
 
-    def persisted(self, ticket: int) -> Iterator[Effect]:
-        """The records of one of this desk's answers are kept: answer."""
-        session = self._recorded.pop(ticket, "")
-        if self._recording.get(session) == ticket:
-            del self._recording[session]
-            found = self._state.sessions.by_id.get(session)
-            if found is not None:
-                found.durable = found.present = True
-        for reply_to, answer in self._answers_after.pop(ticket):
-            yield Reply(reply_to, answer)
+        Args:
+            reply_to: Where the answer goes.
+            answer: The answer.
+            records: What is to be kept first; nothing: what an earlier answer waits for.
+            durability: What the records must survive.
+            session: The session that is durable with its record.
+        """
+        reply = Reply(reply_to, answer)
+        if records:
+            self._count += 1
+            self._unanswered[self._count] = [reply]
+            then = partial(self._durable, self._count, session)
+            yield from self._state.persist(records, durability, then)
+        elif self._unanswered:
+            next(reversed(self._unanswered.values())).append(reply)
+        else:
+            yield reply
+
+    def _durable(self, number: int, session: Session | None, _: int) -> Iterable[Effect]:
+        """Answer: the records are kept."""
+        if session is not None and self._recording.get(session.session) is session:
+            del self._recording[session.session]
+            session.durable = session.present = True
+        return self._unanswered.pop(number)
 
     def on_register(self, message: Register, reply_to: int) -> Iterator[Effect]:
         """Create world contexts and register aspects, all or none."""
@@ -203,8 +205,7 @@ class SessionDesk:
         if session is None:
             yield Reply(reply_to, EpochChanged(self._state.epoch))
             return
-        session.renewed_ns = max(session.renewed_ns, self._state.now_ns)
-        session.count_seen = max(session.count_seen, message.count)
+        session.renew(self._state.now_ns, message.count)
         if message.report:  # kept for listings, which leave longer ones out
             session.report = message.report if len(message.report) <= REPORT_BYTES_MAX else b""
         lowest = {view.lane: view.seq for view in message.view}

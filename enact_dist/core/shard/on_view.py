@@ -57,11 +57,15 @@ class ViewDesk:
 
     def on_take_view(self, message: TakeView, reply_to: int) -> Iterator[Effect]:
         """Show committed data without a lock."""
-        state = self._state
+        state, items = self._state, message.items
         session = state.session_in_epoch(message.lock.session, message.epoch)
-        refusal = self._locks.refused(session, message.map_version, message.items)
-        if refusal is not None or session is None:
-            yield Reply(reply_to, refusal or EpochChanged(state.epoch))
+        if session is None:
+            yield Reply(reply_to, EpochChanged(state.epoch))
+            return
+        shape = state.tenures.shapes.get(items)
+        refusal = self._locks.refused(message.map_version, items, shape)
+        if refusal is not None:
+            yield Reply(reply_to, refusal)
             return
         if message.at_ns < 0:
             yield Reply(
@@ -72,8 +76,7 @@ class ViewDesk:
             yield Reply(reply_to, self._in_the_future(message.at_ns))
             return
         # Whatever is counted renews: the client believes from the newest counter that was seen.
-        session.renewed_ns = max(session.renewed_ns, state.now_ns)
-        session.count_seen = max(session.count_seen, message.count)
+        session.renew(state.now_ns, message.count)
         state.stamp(max(message.seen_stamp_ns, message.at_ns))
         full = len(self._parked) >= WAITING_MAX
         if not full and message.at_ns and self._waits(reply_to, message):

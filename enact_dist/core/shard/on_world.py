@@ -22,6 +22,7 @@ Rules a change must keep
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.checks import unknown_world, wrong_name
@@ -44,7 +45,6 @@ from enact_dist.core.protocol.records import (
     NOTHING,
     Content,
     KeptRecord,
-    Persist,
     Record,
     Reply,
     SlotRecord,
@@ -99,12 +99,7 @@ class WorldDesk:
         self._prepares = prepares
         self._waiting: dict[str, _Act] = {}
         self.waits: Collection[str] = self._waiting
-        self._at_store: dict[int, _Act] = {}
-
-    @property
-    def waits_for_store(self) -> bool:
-        """Whether an answer waits for its records to be durable."""
-        return bool(self._at_store)
+        self._at_store: dict[str, _Act] = {}
 
     # ---------------------------------------------------------------- fork
 
@@ -220,7 +215,7 @@ class WorldDesk:
             yield from self._told(act, latest)
             return
         act.made = tuple(made)
-        yield self._persist(act, tuple(records))
+        yield from self._persist(act, tuple(records))
 
     def _forked(self, world: str) -> Forked:
         slots = sum(1 for _ in self._state.slots.of_context(world))
@@ -244,7 +239,7 @@ class WorldDesk:
         state.catalogue.drop_world(world)
         state.busy_worlds[world] = "being dropped"
         dropped = WorldDropped(world, state.slots.version_base(world))
-        yield self._persist(act, (dropped, *self._labels_without(world)))
+        yield from self._persist(act, (dropped, *self._labels_without(world)))
 
     def _labels_without(self, world: str) -> Iterator[KeptRecord]:
         """Yield what the labels that keep versions of a context keep of others."""
@@ -283,19 +278,14 @@ class WorldDesk:
 
     # ---------------------------------------------------------------- both
 
-    def _persist(self, act: _Act, records: tuple[Record, ...]) -> Effect:
-        ticket = self._state.commits.new_ticket()
-        self._at_store[ticket] = act
-        return Persist(ticket, records, Durability.DURABLE)
+    def _persist(self, act: _Act, records: tuple[Record, ...]) -> list[Effect]:
+        self._at_store[act.message.world] = act
+        return self._state.persist(records, Durability.DURABLE, partial(self._persisted, act))
 
-    def is_mine(self, ticket: int) -> bool:
-        """Whether the store was asked to keep a fork or a drop under this number."""
-        return ticket in self._at_store
-
-    def persisted(self, ticket: int) -> Iterator[Effect]:
+    def _persisted(self, act: _Act, _: int) -> Iterator[Effect]:
         """A fork or a drop survives: carry it out, tell who watches, answer."""
-        act = self._at_store.pop(ticket)
         message, state = act.message, self._state
+        del self._at_store[message.world]
         self._end(act)
         if isinstance(message, Fork):
             state.catalogue.add_world(WorldEntry(*_fork_of(message)))
@@ -319,8 +309,7 @@ class WorldDesk:
             yield from state.commits.publish(changes[first : first + CHANGES_MAX])
 
     def _under_way(self, world: str) -> _Act | None:
-        acts = (*self._waiting.values(), *self._at_store.values())
-        return next((act for act in acts if act.message.world == world), None)
+        return self._waiting.get(world) or self._at_store.get(world)
 
     def _end(self, act: _Act) -> None:
         self._waiting.pop(act.message.world, None)

@@ -91,7 +91,7 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.records import Event
 
 _DECIDE: Final = frozenset((Persisted, Called, Drain))
-"""After these, what was undecided may be decided; after no other message."""
+"""After these, what was undecided may be decided; without a store after any message."""
 
 
 class Shard:
@@ -189,39 +189,47 @@ class Shard:
             wall_ns: This host's wall clock, since 1970; used for stamps only.
         """
         state = self.state
-        self._advance(now_ns, wall_ns)
-        state.asker = identity
+        gap_ns = now_ns - state.now_ns
+        if gap_ns > 0:
+            if gap_ns > (state.sessions.shortest_ttl_ns or state.settings.ttl_ns_max) // 4:
+                self._stalled(gap_ns)
+            state.now_ns = now_ns
+        state.wall_ns, state.asker = wall_ns, identity
+        stamps, ahead_ns = state.stamps, wall_ns - state.now_ns
+        if ahead_ns > stamps.ahead_ns:  # noqa: PLR1730 - as in `Stamps.next`
+            stamps.ahead_ns = ahead_ns
+        stamps.wall_ns_max = state.now_ns + stamps.ahead_ns
         refusal = (
             owners.refusal(message, identity, state.sessions, state.epoch) if identity else None
         )
         if refusal is None:
-            effects = list(self._handlers[type(message)](message, reply_to))
+            found = self._handlers[type(message)](message, reply_to)
+            effects: list[Effect] = found if type(found) is list else list(found)
         else:
             effects = [Reply(reply_to, refusal)]
             if type(refusal) is EpochChanged:
                 state.count("epoch_refusals")
             else:
                 state.count("requests_refused")
+        if not state.stored:
+            effects += self._stamps.answer_reached()
         if self._views.waits or self._worlds.waits:
-            decided = type(message) in _DECIDE
+            decided = not state.stored or type(message) in _DECIDE
             effects += self._views.answer_parked(decided=decided)
             effects += self._worlds.answer_waiting(decided=decided)
         if state.tenures.table.ready:
             effects += state.grant_ready()
         return effects
 
-    def _advance(self, now_ns: int, wall_ns: int) -> None:
-        """Move the time; if this host itself stood still, extend all leases by that time."""
-        state = self.state
-        gap_ns = now_ns - state.now_ns
-        if gap_ns > (state.sessions.shortest_ttl_ns or state.settings.ttl_ns_max) // 4:
-            state.sessions.stalled(gap_ns)
-            state.tenures.stalled(gap_ns)
-            state.count("stalls")
-        if gap_ns > 0:
-            state.now_ns = now_ns
-        state.wall_ns = wall_ns
-        state.stamps.passes(now_ns=state.now_ns, wall_ns=wall_ns)
+    def keep_nothing(self) -> None:
+        """Go on without a store from the start: what waits for records does so at once."""
+        self.state.stored = False
+
+    def _stalled(self, gap_ns: int) -> None:
+        """Extend all leases by the time that this host itself stood still."""
+        self.state.sessions.stalled(gap_ns)
+        self.state.tenures.stalled(gap_ns)
+        self.state.count("stalls")
 
     def next_deadline_ns(self) -> int:
         """Return the monotonic time at which a `Tick` is due at the latest."""
@@ -261,8 +269,7 @@ class Shard:
             tenure.token is not None and (tenure.committing or tenure.prepared is None)
             for tenure in self.state.tenures.by_lock.values()
         )
-        waits = self._sessions.waits_for_store or self._worlds.waits_for_store
-        return not self.state.commits.in_flight and not held and not waits
+        return not held and not self.state.waits_for_store
 
     # ---------------------------------------------------------------- commits
 
@@ -281,16 +288,8 @@ class Shard:
         return state.commits.validate(message, reply_to=reply_to, now_ns=state.now_ns)
 
     def _on_persisted(self, message: Persisted, _: int) -> Iterator[Effect]:
-        if message.ticket > 0:
-            if self.state.commits.is_commit(message.ticket):
-                yield from self.state.commits.persisted(message.ticket, now_ns=self.state.now_ns)
-            elif self._worlds.is_mine(message.ticket):
-                yield from self._worlds.persisted(message.ticket)
-            else:
-                yield from self._prepares.persisted(message.ticket)
-            yield from self._stamps.answer_reached()
-        else:
-            yield from self._sessions.persisted(message.ticket)
+        yield from self.state.persisted(message.ticket)
+        yield from self._stamps.answer_reached()
 
     def _on_called(self, message: Called, reply_to: int) -> Iterator[Effect]:
         if isinstance(message.answer, Places):

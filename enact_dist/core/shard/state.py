@@ -6,6 +6,7 @@ the desk that the message is for.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -17,6 +18,7 @@ from enact_dist.core.protocol.messages import (
     Refused,
     WorldEntry,
 )
+from enact_dist.core.protocol.records import Persist
 from enact_dist.core.shard.pins import Pins
 from enact_dist.core.shard.quotas import Quotas
 from enact_dist.core.state.audit import Audit
@@ -29,7 +31,7 @@ from enact_dist.core.state.sessions import Session, SessionTable
 from enact_dist.core.state.slots import SlotMap
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
     from enact_dist.core.protocol.datum import LockId
     from enact_dist.core.protocol.messages import (
@@ -40,7 +42,8 @@ if TYPE_CHECKING:
         Fork,
         KeepVersions,
     )
-    from enact_dist.core.protocol.records import Effect, Recovered
+    from enact_dist.core.protocol.records import Effect, Record, Recovered, Then
+    from enact_dist.terms import Durability
 
 FETCH_BYTES_MAX: Final = 4 << 20
 """Largest part of a datum in one answer, so that small answers never wait long behind it."""
@@ -88,6 +91,7 @@ class ShardState:
         busy_worlds: The operation in progress on a context of this name, which is unusable
             meanwhile.
         by_hand: The last lock broken and the last one aborted by operators: request and answer.
+        stored: Whether there is a store; without one, records are kept as long as this process.
         draining: The shard is about to stop and grants nothing.
         doubled: The shards of the cell that several daemons serve now, with the start of each.
     """
@@ -100,7 +104,10 @@ class ShardState:
         self.now_ns, self.wall_ns, self.born_ns = now_ns, wall_ns, now_ns
         self.asker = ""
         self.draining = False
-        self.counters: dict[str, int] = {}
+        self.stored = True
+        self._then: dict[int, Then] = {}
+        self._ticket = 0
+        self.counters: dict[str, int] = defaultdict(int)
         self.pins = Pins()
         self.busy_worlds: dict[str, str] = {}
         self.doubled: dict[str, tuple[int, ...]] = {}
@@ -129,7 +136,7 @@ class ShardState:
         self.slots.recover_history(recovered.history, recovered.kept)
         self.sessions = SessionTable(recovered.sessions, outcomes=recovered.outcomes, now_ns=now_ns)
         self.tenures = Tenures(
-            epoch=self.epoch, slots=self.slots, sessions=self.sessions, count=self.count
+            epoch=self.epoch, slots=self.slots, sessions=self.sessions, counters=self.counters
         )
         self.quotas = Quotas(self.count)
         self.audit = Audit(recovered.audit)
@@ -144,12 +151,38 @@ class ShardState:
             tenures=self.tenures,
             stamps=self.stamps,
             decisions=self.decisions,
-            count=self.count,
+            counters=self.counters,
+            persist=self.persist,
         )
 
     def count(self, name: str, count: int = 1) -> None:
         """Add to one of the shard's statistics."""
-        self.counters[name] = self.counters.get(name, 0) + count
+        self.counters[name] += count
+
+    def persist(
+        self, records: tuple[Record, ...], durability: Durability, then: Then
+    ) -> list[Effect]:
+        """Have the store keep records, and go on once it has; at once without a store."""
+        if not self.stored:
+            return list(then(self.now_ns))
+        self._ticket += 1
+        self._then[self._ticket] = then
+        return [Persist(self._ticket, records, durability)]
+
+    def persisted(self, ticket: int) -> Iterable[Effect]:
+        """Go on: the store has kept what it was asked for under this number."""
+        return self._then.pop(ticket)(self.now_ns)
+
+    @property
+    def waits_for_store(self) -> bool:
+        """Whether something goes on only once the store has kept its records."""
+        return bool(self._then)
+
+    def epoch_changed(self, epoch: int) -> EpochChanged:
+        """Refuse what names another epoch, or a session that has sent no hello in this one."""
+        if epoch != self.epoch:
+            self.count("epoch_refusals")
+        return EpochChanged(self.epoch)
 
     def session_in_epoch(self, session: str, epoch: int) -> Session | None:
         """Return the session if it and the client's idea of the epoch are current."""
@@ -168,8 +201,7 @@ class ShardState:
         session = self.session_in_epoch(message.session, message.epoch)
         if session is None:
             return EpochChanged(self.epoch)
-        session.renewed_ns = max(session.renewed_ns, self.now_ns)
-        session.count_seen = max(session.count_seen, message.count)
+        session.renew(self.now_ns, message.count)
         count, answer = session.act
         if message.count > count:
             session.act = (message.count, None)
@@ -201,11 +233,7 @@ class ShardState:
 
     def stamp(self, seen_ns: int = 0) -> int:
         """Return the present, after everything that an honest client has seen."""
-        if seen_ns > self.stamps.last_ns and not self.stamps.too_far_ahead(
-            seen_ns, wall_ns=self.wall_ns
-        ):
-            self.stamps.last_ns = seen_ns
-        return self.stamps.now(wall_ns=self.wall_ns)
+        return self.stamps.now(wall_ns=self.wall_ns, seen_ns=seen_ns)
 
     def forget_top(self, lock: LockId) -> None:
         """Let a lock that never was granted be asked for again under the same seq."""

@@ -26,6 +26,7 @@ and outcome are one record of the store, so an outcome is known exactly when the
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.checks import (
@@ -60,13 +61,13 @@ from enact_dist.core.protocol.records import (
     DecisionRecord,
     Effect,
     OutcomeRecord,
-    Persist,
     Publish,
     Record,
     Reply,
     SlotRecord,
+    cause_bytes,
 )
-from enact_dist.core.state.causes import cause_of
+from enact_dist.core.state.grants import X
 from enact_dist.core.state.sessions import Lane
 from enact_dist.terms import Durability, NullReason
 
@@ -75,6 +76,7 @@ if TYPE_CHECKING:
 
     from enact_dist.core.protocol.datum import LockId, Token
     from enact_dist.core.protocol.messages import Cause, Prepare
+    from enact_dist.core.protocol.records import Then
     from enact_dist.core.state.catalogue import Catalogue
     from enact_dist.core.state.clock import Stamps
     from enact_dist.core.state.decisions import Decisions
@@ -90,10 +92,11 @@ _STRICTNESS: Final = (Durability.VOLATILE, Durability.OS, Durability.DURABLE)
 
 @dataclass(slots=True)
 class _InFlight:
-    """A commit that the store is working on."""
+    """A commit that the store is working on; `new` says that some of its slots were not there."""
 
     tenure: Tenure
     writes: tuple[WriteItem, ...]
+    new: bool
     outcome: OutcomeRecord
     cause: Cause
     reply_to: list[int] = field(default_factory=list)
@@ -105,17 +108,17 @@ class Commits:
 
     __slots__ = (
         "_catalogue",
-        "_count",
+        "_counters",
         "_decisions",
         "_epoch",
         "_in_flight",
         "_peers",
+        "_persist",
         "_sessions",
         "_shard",
         "_slots",
         "_stamps",
         "_tenures",
-        "_ticket",
         "notice_number",
     )
 
@@ -131,7 +134,8 @@ class Commits:
         tenures: Tenures,
         stamps: Stamps,
         decisions: Decisions,
-        count: Callable[..., None],
+        counters: dict[str, int],
+        persist: Callable[[tuple[Record, ...], Durability, Then], list[Effect]],
     ) -> None:
         self._decisions = decisions
         self._shard = shard
@@ -142,25 +146,15 @@ class Commits:
         self._sessions = sessions
         self._tenures = tenures
         self._stamps = stamps
-        self._count = count
-        self._in_flight: dict[int, _InFlight] = {}
-        self._ticket = 0
+        self._counters = counters
+        self._in_flight: dict[LockId, _InFlight] = {}
+        self._persist = persist
         self.notice_number = 0
-
-    @property
-    def in_flight(self) -> int:
-        """How many commits the store is working on."""
-        return len(self._in_flight)
 
     def undecided(self) -> Iterator[tuple[int, tuple[WriteItem, ...]]]:
         """Yield stamp and writes of each commit that the store is working on."""
         for commit in self._in_flight.values():
             yield commit.outcome.position.stamp_ns, commit.writes
-
-    def new_ticket(self) -> int:
-        """Return a number for the store to report under."""
-        self._ticket += 1
-        return self._ticket
 
     def position_of(self, lock: LockId) -> Position | None:
         """Return the position at which a lock has finally committed, as far as still known."""
@@ -176,33 +170,32 @@ class Commits:
         self, message: Commit, *, reply_to: int, now_ns: int, wall_ns: int
     ) -> Iterable[Effect]:
         """Apply a commit, or say why not; the same commit again gets the same answer."""
-        recorded = self._recorded(message.lock)
+        lock = message.lock
+        recorded = self._recorded(lock)
         if recorded is not None:
-            self._count("commits_repeated")
-            committed = Committed(recorded.lock, recorded.position, recorded.versions)
-            return [Reply(reply_to, committed)]
-        tenure = self._tenures.by_lock.get(message.lock)
-        at_store = tenure is not None and tenure.committing
-        in_flight = self._in_flight_of(message.lock) if at_store else None
-        if in_flight is not None:
-            in_flight.reply_to.append(reply_to)
+            self._counters["commits_repeated"] += 1
+            return [Reply(reply_to, Committed(lock, recorded.position, recorded.versions))]
+        tenure = self._tenures.by_lock.get(lock)
+        if tenure is not None and tenure.committing and lock in self._in_flight:
+            self._in_flight[lock].reply_to.append(reply_to)
             return []
-        refusal = self.refusal(message, tenure, wall_ns=wall_ns)
+        new = not self._slots.exist(message.writes)
+        refusal = self.refusal(message, tenure, new=new, wall_ns=wall_ns)
         if refusal is not None:
             return self._refused(refusal, tenure, reply_to=reply_to, now_ns=now_ns)
         assert tenure is not None
-        moved = self.moved_on(message.expects, message.lock) if message.expects else None
+        moved = self.moved_on(message.expects, lock) if message.expects else None
         if moved is not None:
             return self.changed(tenure, moved, reply_to=reply_to, now_ns=now_ns)
         stamp_ns = self._stamps.next(seen_ns=message.seen_stamp_ns, wall_ns=wall_ns)
         next_version = self._slots.next_version
         versions = tuple([SlotVersion(slot, next_version(slot)) for slot, _ in message.writes])
-        outcome = OutcomeRecord(message.lock, Position(stamp_ns, self._shard), versions)
-        session = self._sessions.by_id[message.lock.session]
-        cause = cause_of(message, session, versions, stamp_ns, now_ns - tenure.granted_ns)
-        commit = _InFlight(tenure, message.writes, outcome, cause, [reply_to])
+        outcome = OutcomeRecord(lock, Position(stamp_ns, self._shard), versions)
+        session = self._sessions.by_id[lock.session]
+        cause = session.cause(message, versions, stamp_ns, now_ns - tenure.granted_ns)
+        commit = _InFlight(tenure, message.writes, new, outcome, cause, [reply_to])
         if message.participants:
-            commit.decision = DecisionRecord(message.lock, outcome.position, message.participants)
+            commit.decision = DecisionRecord(lock, outcome.position, message.participants)
         return self._make_durable(commit, now_ns=now_ns)
 
     def _refused(
@@ -239,7 +232,7 @@ class Commits:
         session = self._sessions.known(tenure.lock.session)
         if session is not None:
             session.lane(tenure.lock.lane).changed = answer
-        self._count("commits_changed")
+        self._counters["commits_changed"] += 1
         yield from self._tenures.remove(tenure, now_ns=now_ns)
         yield Reply(reply_to, answer)
 
@@ -261,22 +254,23 @@ class Commits:
 
     def _make_durable(self, commit: _InFlight, *, now_ns: int) -> Iterable[Effect]:
         """Hand the commit to the store, or apply it at once where nothing is to survive."""
-        durability = self._strictest(commit)
-        versions, stamp_ns = commit.outcome.versions, commit.outcome.position.stamp_ns
-        if durability is Durability.VOLATILE and self._slots.exist(versions):
+        durability, outcome = self._strictest(commit), commit.outcome
+        if durability is Durability.VOLATILE and not commit.new:
             return self._apply(commit, now_ns=now_ns)
-        kept = self.records(commit.writes, versions, stamp_ns, commit.cause)
-        ticket = self.new_ticket()
+        stamp_ns = outcome.position.stamp_ns
+        kept = self.records(commit.writes, outcome.versions, stamp_ns, commit.cause)
         commit.tenure.committing = True
-        self._in_flight[ticket] = commit
+        self._in_flight[outcome.lock] = commit
         if durability is Durability.VOLATILE:
             # Once per slot: a reader that finds it null after a restart learns that it was lost.
             durability = Durability.OS
         else:
-            kept = (*kept, commit.outcome)
+            kept = (*kept, outcome)
         decision = (commit.decision,) if commit.decision is not None else ()
         forgotten = self._slots.history.take_forgotten()
-        return [Persist(ticket, (*kept, *decision, *forgotten), durability)]
+        return self._persist(
+            (*kept, *decision, *forgotten), durability, partial(self._persisted, commit)
+        )
 
     def _strictest(self, commit: _InFlight) -> Durability:
         """Return what a commit must survive: the most that one of its data asks for.
@@ -292,32 +286,31 @@ class Commits:
                 strictest = max(strictest, durability, key=_STRICTNESS.index)
         return strictest
 
-    def persisted(self, ticket: int, *, now_ns: int) -> Iterable[Effect]:
+    def _persisted(self, commit: _InFlight, now_ns: int) -> Iterable[Effect]:
         """The store is done: apply, release and answer."""
-        commit = self._in_flight.pop(ticket)
+        del self._in_flight[commit.outcome.lock]
         commit.tenure.committing = False
         return self._apply(commit, now_ns=now_ns)
-
-    def is_commit(self, ticket: int) -> bool:
-        """Whether the store was asked to keep a commit under this number."""
-        return ticket in self._in_flight
 
     def _apply(self, commit: _InFlight, *, now_ns: int) -> Iterable[Effect]:
         lock, outcome = commit.tenure.lock, commit.outcome
         stamp_ns = outcome.position.stamp_ns
         changes = self.apply_writes(commit.writes, outcome.versions, stamp_ns, commit.cause)
-        lanes = self._sessions.lanes_of(lock.session)
+        session = self._sessions.by_id.get(lock.session)
+        lanes = session.lanes if session is not None else self._sessions.lanes_of(lock.session)
         if lanes is not None:
-            lane = lanes.get(lock.lane)
-            if lane is None:
-                lane = lanes[lock.lane] = Lane()
+            if lock.lane not in lanes:
+                lanes[lock.lane] = Lane()
+            lane = lanes[lock.lane]
             # A commit whose client gave up may end after a newer one of its lane.
             if lane.outcome is None or lane.outcome.lock.seq < lock.seq:
                 lane.outcome = outcome
-        effects = list(self._tenures.remove(commit.tenure, now_ns=now_ns))
-        self._count("commits")
-        committed = Committed(outcome.lock, outcome.position, outcome.versions)
-        effects += [Reply(reply_to, committed) for reply_to in commit.reply_to]
+        effects: list[Effect] = []
+        effects += self._tenures.remove(commit.tenure, now_ns=now_ns)
+        self._counters["commits"] += 1
+        committed = Committed(lock, outcome.position, outcome.versions)
+        for reply_to in commit.reply_to:
+            effects += (Reply(reply_to, committed),)
         effects += self.publish(changes)
         if commit.decision is not None:
             effects += self._decisions.decided(commit.decision, now_ns=now_ns)
@@ -331,15 +324,18 @@ class Commits:
         cause: Cause | None,
     ) -> list[SlotChange]:
         """Make writes visible; return what a notice tells of them."""
-        changes, size = [], 0
+        changes: list[SlotChange] = []
+        size, replace = 0, self._slots.replace
+        lineage = cause_bytes(cause) if cause is not None and cause.reads else 0
         for (_, datum), (slot, version) in zip(writes, versions, strict=True):
-            content = Content(version, stamp_ns, datum, _DELETED, cause)
-            self._slots.replace(slot, content)
-            captured_ns = 0
+            captured_ns, own = 0, lineage
             if datum is not None:
                 captured_ns, size = datum.stamp_ns, size + datum.size
-            changes.append(SlotChange(slot, version, stamp_ns, datum is None, captured_ns))
-        self._count("bytes_written", size)
+                if not datum.file and datum.fault is None:
+                    own += datum.size
+            replace(slot, Content(version, stamp_ns, datum, _DELETED, cause, own))
+            changes += (SlotChange(slot, version, stamp_ns, datum is None, captured_ns),)
+        self._counters["bytes_written"] += size
         return changes
 
     def publish(self, changes: list[SlotChange]) -> Iterable[Effect]:
@@ -377,9 +373,9 @@ class Commits:
     # ---------------------------------------------------------------- fence
 
     def refusal(
-        self, message: Commit | Prepare, tenure: Tenure | None, *, wall_ns: int
+        self, message: Commit | Prepare, tenure: Tenure | None, *, new: bool, wall_ns: int
     ) -> Fenced | Changed | EpochChanged | Refused | None:
-        """Return why this holder may not write this now, None if it may."""
+        """Return why this holder may not write this now, `new` slots among it; None if it may."""
         # The fence comes first: what a stranger asks must not end the holder's lock.
         fenced = self._fence(message.lock, message.token, tenure)
         if fenced is not None:
@@ -388,39 +384,43 @@ class Commits:
         wrong = wrong_commit(message, peers=self._peers)
         if wrong is not None:
             return wrong
-        if tenure.bound:
+        if tenure.committing or tenure.prepared is not None:
             return Refused("protocol", f"{message.lock} is being committed in another way")
-        for slot, _ in message.writes:
-            if not tenure.covers(slot):
+        wants, writes, whole = tenure.claim.wants, message.writes, True
+        for slot, datum in writes:
+            if datum is not None and len(datum.body) != datum.size:
+                whole = False
+            if not (slot in wants and wants[slot] is X) and not tenure.covers(slot):
                 return Refused("protocol", f"{message.lock} does not hold {slot} for writing")
-        for slot, _ in message.writes:
-            # Everybody whose pattern covers it must be able to read its name.
-            if not self._slots.exists(slot):
+        if new:
+            # Everybody whose pattern covers a slot must be able to read its name.
+            for slot, _ in writes:
                 wrong = wrong_name("entity", slot.entity, slashes=True)
-                if wrong is not None:
+                if wrong is not None and not self._slots.exists(slot):
                     return wrong
-        if self._stamps.too_far_ahead(message.seen_stamp_ns, wall_ns=wall_ns):
-            ahead_s = (message.seen_stamp_ns - wall_ns) / 1e9
+        seen_ns = message.seen_stamp_ns
+        if seen_ns > wall_ns and self._stamps.too_far_ahead(seen_ns, wall_ns=wall_ns):
+            ahead_s = (seen_ns - wall_ns) / 1e9
             return Refused(
                 "clock_skew",
                 f"the client has seen a commit stamped {ahead_s:.1f} s ahead of the clock of shard"
                 f" {self._shard}; at most 1 s is accepted; set the clocks of both hosts",
             )
-        return missing_payload(message.writes)
+        return None if whole else missing_payload(writes)
 
     def _fence(
         self, lock: LockId, token: Token, tenure: Tenure | None
     ) -> Fenced | Changed | EpochChanged | None:
         """Return None only if exactly this grant is live."""
-        session = self._sessions.known(lock.session)
-        if token.epoch != self._epoch or session is None:
-            self._count("epoch_refusals")
+        session = self._sessions.by_id.get(lock.session)
+        if token.epoch != self._epoch or session is None or not session.present:
+            self._counters["epoch_refusals"] += 1
             return EpochChanged(self._epoch)
         if tenure is None or tenure.token != token:
             lane = session.lanes.get(lock.lane)
             if lane is not None and lane.changed is not None and lane.changed.lock == lock:
                 return lane.changed
-            self._count("fenced")
+            self._counters["fenced"] += 1
             return Fenced(lock, self._cause(lock))
         return None
 
@@ -432,40 +432,39 @@ class Commits:
 
     # ---------------------------------------------------------------- validate, outcome
 
-    def validate(self, message: Validate, *, reply_to: int, now_ns: int) -> Iterator[Effect]:
+    def validate(self, message: Validate, *, reply_to: int, now_ns: int) -> Iterable[Effect]:
         """Confirm that reads and expectations hold until now, and release the reads."""
-        if not message.token.number:
-            yield Reply(reply_to, self._expected(message))
-            return
-        session = self._sessions.known(message.lock.session)
-        lane = session.lanes.get(message.lock.lane) if session is not None else None
-        if lane is not None and lane.validated == (message.lock, message.token):
-            yield Reply(reply_to, Valid(message.lock))
-            return
-        tenure = self._tenures.by_lock.get(message.lock)
-        fenced = self._fence(message.lock, message.token, tenure)
-        if fenced is None and tenure is not None and not tenure.bound:
-            assert session is not None
-            moved = self.moved_on(message.expects, message.lock)
-            if moved is not None:
-                yield from self.changed(tenure, moved, reply_to=reply_to, now_ns=now_ns)
-                return
-            session.lane(message.lock.lane).validated = (message.lock, message.token)
-            yield from self._tenures.remove(tenure, now_ns=now_ns)
-            self._count("locks_validated")
-            yield Reply(reply_to, Valid(message.lock))
-        else:
-            yield Reply(reply_to, fenced or Fenced(message.lock, NOT_HELD))
+        lock, token = message.lock, message.token
+        if not token.number:
+            return [Reply(reply_to, self._expected(message))]
+        session = self._sessions.known(lock.session)
+        lane = session.lanes.get(lock.lane) if session is not None else None
+        if lane is not None and lane.validated == (lock, token):
+            return [Reply(reply_to, Valid(lock))]
+        tenure = self._tenures.by_lock.get(lock)
+        fenced = self._fence(lock, token, tenure)
+        if fenced is not None or tenure is None or tenure.bound:
+            return [Reply(reply_to, fenced or Fenced(lock, NOT_HELD))]
+        assert session is not None
+        moved = self.moved_on(message.expects, lock) if message.expects else None
+        if moved is not None:
+            return self.changed(tenure, moved, reply_to=reply_to, now_ns=now_ns)
+        session.lane(lock.lane).validated = (lock, token)
+        effects: list[Effect] = []
+        effects += self._tenures.remove(tenure, now_ns=now_ns)
+        self._counters["locks_validated"] += 1
+        effects += (Reply(reply_to, Valid(lock)),)
+        return effects
 
     def _expected(self, message: Validate) -> Valid | Changed | EpochChanged:
         """Compare the expectations of a lock that holds nothing here."""
         if message.token.epoch != self._epoch or not self._sessions.known(message.lock.session):
-            self._count("epoch_refusals")
+            self._counters["epoch_refusals"] += 1
             return EpochChanged(self._epoch)
         moved = self.moved_on(message.expects, message.lock)
         if moved is None:
             return Valid(message.lock)
-        self._count("commits_changed")
+        self._counters["commits_changed"] += 1
         return Changed(message.lock, *moved)
 
     def outcome(self, message: Outcome, *, reply_to: int) -> Iterator[Effect]:
@@ -489,11 +488,9 @@ class Commits:
         yield Reply(reply_to, OutcomeIs(message.lock, self._epoch, kind, position, versions))
 
     def _recorded(self, lock: LockId) -> OutcomeRecord | None:
-        lanes = self._sessions.lanes_of(lock.session)
-        lane = lanes.get(lock.lane) if lanes is not None else None
-        outcome = lane.outcome if lane is not None else None
+        session = self._sessions.by_id.get(lock.session)
+        lanes = session.lanes if session is not None else self._sessions.lanes_of(lock.session)
+        if not lanes or lock.lane not in lanes:
+            return None
+        outcome = lanes[lock.lane].outcome
         return outcome if outcome is not None and outcome.lock == lock else None
-
-    def _in_flight_of(self, lock: LockId) -> _InFlight | None:
-        """Return the commit of a lock that the store works on; it may work on a promise instead."""
-        return next((c for c in self._in_flight.values() if c.tenure.lock == lock), None)

@@ -35,7 +35,7 @@ from enact_dist.patterns import pattern_matches
 from enact_dist.terms import ACCESSES, Access
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Iterable, Iterator
 
     from enact_dist.core.protocol.records import PreparedRecord
     from enact_dist.core.state.sessions import Session, SessionTable
@@ -61,6 +61,7 @@ class Tenure:
     """One lock at this shard.
 
     Attributes:
+        named: The slots of `items` where none of these is a pattern.
         alone: It holds and views nothing at other shards: its commit decides in one step.
         committing: The store works on its commit, its preparation or its end.
         prepared: What another shard decides about.
@@ -72,10 +73,11 @@ class Tenure:
     items: tuple[Item, ...]
     hold_ns: int
     asked_ns: int
+    named: tuple[Slot, ...] = ()
+    alone: bool = False
     token: Token | None = None
     granted_ns: int = 0
     hold_end_ns: int = 0
-    alone: bool = False
     committing: bool = False
     prepared: PreparedRecord | None = None
     parked: int | None = None
@@ -89,7 +91,7 @@ class Tenure:
 
     def covers(self, slot: Slot) -> bool:
         """Whether this lock may write `slot`."""
-        if self.claim.wants.get(slot) is _X:
+        if self.claim.wants.get(slot) is X:
             return True
         return any(
             item.access == Access.WRITE_EACH
@@ -100,10 +102,25 @@ class Tenure:
 
 
 _WORDS: Final = {Mode.S: "read", Mode.X: "write", Mode.SIX: "read all, write some"}
-_IS, _IX, _S, _X = Mode.IS, Mode.IX, Mode.S, Mode.X
+_IS, _IX, _S, X = Mode.IS, Mode.IX, Mode.S, Mode.X
 SHAPE_ITEMS_MAX: Final = 32
 SHAPES_MAX: Final = 256
-"""Sets of so few requested items, at most so many, whose resources are remembered."""
+"""Sets of so few requested items, at most so many, that are remembered."""
+
+
+@dataclass(slots=True, eq=False)
+class Shape:
+    """What follows from a set of requested items alone.
+
+    Attributes:
+        wants: Which resources they use, and how.
+        named: Their slots where none of them is a pattern, else none.
+        patterns: How many are patterns.
+    """
+
+    wants: dict[Resource, Mode]
+    named: tuple[Slot, ...]
+    patterns: int
 
 
 def wants_of(items: Iterable[Item]) -> dict[Resource, Mode]:
@@ -115,18 +132,27 @@ def wants_of(items: Iterable[Item]) -> dict[Resource, Mode]:
             continue
         column = Column(item.context, item.aspect)
         if access.each:
-            wants[column] = join(wants.get(column), _X if access.writes else _S)
+            wants[column] = join(wants.get(column), X if access.writes else _S)
         else:
             slot = Slot(item.context, item.entity, item.aspect)
-            wants[slot] = join(wants.get(slot), _X if access.writes else _S)
+            wants[slot] = join(wants.get(slot), X if access.writes else _S)
             wants[column] = join(wants.get(column), _IX if access.writes else _IS)
     return wants
+
+
+def shape_of(items: tuple[Item, ...]) -> Shape:
+    """Return what follows from a set of requested items alone."""
+    patterns = sum(ACCESSES[item.access].each for item in items)
+    named = () if patterns else tuple([Slot(i.context, i.entity, i.aspect) for i in items])
+    return Shape(wants_of(items), named, patterns)
 
 
 class Tenures:
     """All tenures of one shard.
 
     Attributes:
+        shapes: The sets of items that were requested lately, all without a fault.
+        waiting_of: How many requests the waiting locks of each identity have.
         waited: How long locks were in the queue until their grant.
     """
 
@@ -139,17 +165,17 @@ class Tenures:
         "_parked_ends",
         "_sessions",
         "_slots",
-        "_waiting",
-        "_wants",
         "by_lock",
         "by_session",
-        "count",
+        "counters",
+        "shapes",
         "table",
         "waited",
+        "waiting_of",
     )
 
     def __init__(
-        self, *, epoch: int, slots: SlotMap, sessions: SessionTable, count: Callable[[str], None]
+        self, *, epoch: int, slots: SlotMap, sessions: SessionTable, counters: dict[str, int]
     ) -> None:
         self._epoch = epoch
         self._slots = slots
@@ -159,33 +185,35 @@ class Tenures:
         self._lease_ends = DueTimes()
         self._over: dict[str, None] = {}
         self._parked_ends: list[tuple[int, int, LockId]] = []
-        self._waiting: dict[str, int] = {}
-        self._wants: dict[tuple[Item, ...], dict[Resource, Mode]] = {}
+        self.waiting_of: dict[str, int] = {}
+        self.shapes: dict[tuple[Item, ...], Shape] = {}
         self.table = LockTable()
         self.by_lock: dict[LockId, Tenure] = {}
         self.by_session: dict[str, dict[LockId, Tenure]] = {}
-        self.count = count
+        self.counters = counters
         self.waited = Latencies()
 
     def of_session(self, session: str) -> list[Tenure]:
         """Return the tenures of one session."""
         return list(self.by_session.get(session, {}).values())
 
-    def enqueue(self, message: Acquire, *, now_ns: int, at_once: bool = False) -> Tenure:
+    def remember(self, items: tuple[Item, ...]) -> None:
+        """Remember the shape of items in which no fault was found, if they are few."""
+        if len(items) <= SHAPE_ITEMS_MAX:
+            if len(self.shapes) >= SHAPES_MAX:
+                self.shapes.clear()
+            self.shapes[items] = shape_of(items)
+
+    def enqueue(
+        self, message: Acquire, shape: Shape, session: Session, *, now_ns: int, at_once: bool
+    ) -> Tenure:
         """Give a new lock its place in the queue; with `at_once` its grant if nothing waits."""
-        items = message.items
-        wants = self._wants.get(items)
-        if wants is None:
-            wants = wants_of(items)
-            if len(items) <= SHAPE_ITEMS_MAX:
-                if len(self._wants) >= SHAPES_MAX:
-                    self._wants.clear()
-                self._wants[items] = wants
-        claim = self.table.enqueue(message.lock, wants, at_once=at_once)
-        hold_ns = message.hold_ns
-        tenure = Tenure(message.lock, claim, items, min(HOLD_NS_MAX, hold_ns), now_ns)
-        tenure.alone = message.alone
-        self._add(tenure)
+        lock, items, hold_ns = message.lock, message.items, message.hold_ns
+        claim = self.table.enqueue(lock, shape.wants, at_once=at_once)
+        if hold_ns > HOLD_NS_MAX:  # noqa: PLR1730 - as in `Stamps.next`
+            hold_ns = HOLD_NS_MAX
+        tenure = Tenure(lock, claim, items, hold_ns, now_ns, shape.named, message.alone)
+        self._add(tenure, session)
         if claim.granted:
             self._begin(tenure, now_ns=now_ns)
         else:
@@ -202,26 +230,28 @@ class Tenures:
             self._hold_ends = [end for end in self._hold_ends if end[1] in self.by_lock]
             heapq.heapify(self._hold_ends)
         heapq.heappush(self._hold_ends, (tenure.hold_end_ns, tenure.lock))
-        self.count("locks_granted")
-        self.waited.add((now_ns - tenure.asked_ns) / 1e9)
-
-    def items_waiting(self, owner: str) -> int:
-        """Return how many requests the waiting locks of an identity have."""
-        return self._waiting.get(owner, 0)
+        self.counters["locks_granted"] += 1
+        if now_ns > tenure.asked_ns:
+            self.waited.add((now_ns - tenure.asked_ns) / 1e9)
+        else:
+            self.waited.counts[0] += 1
 
     def _count_waiting(self, tenure: Tenure, change: int) -> None:
-        items = self.items_waiting(tenure.owner) + change * len(tenure.items)
+        items = self.waiting_of.get(tenure.owner, 0) + change * len(tenure.items)
         if items:
-            self._waiting[tenure.owner] = items
+            self.waiting_of[tenure.owner] = items
         else:
-            self._waiting.pop(tenure.owner, None)
+            self.waiting_of.pop(tenure.owner, None)
 
-    def _add(self, tenure: Tenure) -> None:
+    def _add(self, tenure: Tenure, session: Session | None) -> None:
         lock, name = tenure.lock, tenure.lock.session
-        session = self._sessions.by_id.get(name)
-        tenure.owner = session.identity if session is not None else ""
+        if session is not None:
+            tenure.owner = session.identity
         self.by_lock[lock] = tenure
-        self.by_session.setdefault(name, {})[lock] = tenure
+        if name in self.by_session:
+            self.by_session[name][lock] = tenure
+        else:
+            self.by_session[name] = {lock: tenure}
         if name not in self._lease_ends.due and name not in self._over:
             self._expect_end(name, session, now_ns=tenure.asked_ns)
 
@@ -259,7 +289,7 @@ class Tenures:
         assert granted == [claim], "two prepared locks were never in conflict"
         tenure = Tenure(record.lock, claim, record.items, 0, asked_ns=now_ns, granted_ns=now_ns)
         tenure.token, tenure.prepared = record.token, record
-        self._add(tenure)
+        self._add(tenure, self._sessions.by_id.get(record.lock.session))
 
     def park(self, tenure: Tenure, *, reply_to: int, wait_ns: int, now_ns: int) -> Iterator[Effect]:
         """Keep a waiter's request until the grant or the end of its slice."""
@@ -301,29 +331,31 @@ class Tenures:
             self._count_waiting(tenure, -1)
             self._begin(tenure, now_ns=now_ns)
             if self.table.overtook(claim):
-                self.count("locks_bypassed")
+                self.counters["locks_bypassed"] += 1
             if tenure.parked is not None:
                 reply_to, tenure.parked = tenure.parked, None
                 yield Reply(reply_to, self.granted(tenure, now_ns=now_ns, stamp_ns=stamp_ns))
             elif now_ns > tenure.asked_ns:
                 # No request is parked right now: the client's next call fetches the grant, or its
                 # keep-alive gives it back.
-                self.count("grants_without_listener")
+                self.counters["grants_without_listener"] += 1
 
     def granted(self, tenure: Tenure, *, now_ns: int, stamp_ns: int) -> Granted:
         """Return the grant with its data as of now."""
         assert tenure.token is not None
-        states, pins, from_ns = self._slots.shown(tenure.items)
+        states, pins, from_ns = self._slots.shown(tenure.items, named=tenure.named)
         if pins:
             # Added to: the client may have taken an earlier answer, whose views have moved on.
             tenure.pins.update(pins)
-        session = self._sessions.by_id[tenure.lock.session]
+        lock, hold_left_ns = tenure.lock, tenure.hold_end_ns - now_ns
+        if hold_left_ns < 0:  # noqa: PLR1730 - as in `Stamps.next`
+            hold_left_ns = 0
         return Granted(
-            tenure.lock,
+            lock,
             tenure.token,
             self._epoch,
-            session.count_seen,
-            max(0, tenure.hold_end_ns - now_ns),
+            self._sessions.by_id[lock.session].count_seen,
+            hold_left_ns,
             stamp_ns,
             tuple(states),
             from_ns,
@@ -331,15 +363,16 @@ class Tenures:
 
     def remove(self, tenure: Tenure, *, now_ns: int) -> Iterable[Effect]:
         """End a tenure; who waited for it becomes ready (see `grant_ready`)."""
-        answers = () if tenure.parked is None else (self.waiting(tenure, now_ns),)
+        answers = [] if tenure.parked is None else [self.waiting(tenure, now_ns)]
         if tenure.token is None:
             self._count_waiting(tenure, -1)
         lock = tenure.lock
         self.table.remove(lock)
         del self.by_lock[lock]
         of_session = self.by_session[lock.session]
-        del of_session[lock]
-        if not of_session:
+        if len(of_session) > 1:
+            del of_session[lock]
+        else:
             del self.by_session[lock.session]
         return answers
 
@@ -440,7 +473,7 @@ class Tenures:
         for tenure in self.by_lock.values():
             waiting[tenure.owner] += 0 if tenure.token is not None else len(tenure.items)
         waiting = +waiting
-        assert waiting == self._waiting
+        assert waiting == self.waiting_of
         tokens = [tenure.token for tenure in self.by_lock.values() if tenure.token is not None]
         assert len(tokens) == len(set(tokens))
         for tenure in self.by_lock.values():

@@ -19,8 +19,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from enact_dist.core.protocol.datum import Slot
 from enact_dist.core.protocol.parts import NO_LIMIT, SlotVersion
-from enact_dist.core.protocol.records import HistoryForgotten
-from enact_dist.core.state.causes import cause_bytes
+from enact_dist.core.protocol.records import HistoryForgotten, own_bytes
 from enact_dist.core.state.retention import DEFAULT, Limits, PayloadNames
 from enact_dist.core.state.slot_history import KeptVersion, SlotHistory
 
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.records import Content
 
 LOOSE_NS: Final = 2_000_000_000
-"""How long any replaced state is kept, on the clock of the stamps."""
+"""How long any replaced state is kept, on the clock of the stamps; older ones go with a tick."""
 LOOSE_BYTES_MAX: Final = 64 << 20
 """Bytes of data, payloads included, that only this keeps."""
 LOOSE_STATES_MAX: Final = 50_000
@@ -131,14 +130,10 @@ class History:
             self._release_all(found)  # an earlier, larger retention may have kept versions
         found.until_ns = until_ns
         found.young += 1
-        self._recent.append((until_ns, found))
-        self._append(found, old, policy.limits)
         recent = self._recent
-        if (
-            recent[0][0] < until_ns - LOOSE_NS
-            or self._loose_bytes > LOOSE_BYTES_MAX
-            or len(recent) > LOOSE_STATES_MAX
-        ):
+        recent.append((until_ns, found))
+        self._append(found, old, policy.limits)
+        if self._loose_bytes > LOOSE_BYTES_MAX or len(recent) > LOOSE_STATES_MAX:
             self._end_recent(until_ns - LOOSE_NS)
         if self.count > HELD_STATES_MAX or self.bytes > self._bytes_max:
             self._fit()
@@ -160,7 +155,7 @@ class History:
             return
         found.held += 1
         self.count += 1
-        self.bytes += _own_bytes(old)
+        self.bytes += old.bytes if old.bytes >= 0 else own_bytes(old)
         if datum is not None:
             found.size += datum.size
             if datum.file:
@@ -194,7 +189,7 @@ class History:
         found.held -= 1
         self.count -= 1
         self._loose += 1
-        self.bytes -= _own_bytes(old)
+        self.bytes -= old.bytes if old.bytes >= 0 else own_bytes(old)
         datum = old.datum
         if datum is not None:
             found.size -= datum.size
@@ -374,7 +369,7 @@ class History:
         kept = found.kept.get(content.version)
         if kept is None:
             kept = found.kept[content.version] = KeptVersion(content, until_ns)
-            self.kept_bytes += _own_bytes(content)
+            self.kept_bytes += own_bytes(content)
             self._payloads.count(content.datum, stays=1)
         kept.labels.add(label)
         self.labels.setdefault(label, {})[SlotVersion(found.slot, content.version)] = None
@@ -396,7 +391,7 @@ class History:
         if kept.labels:
             return
         del found.kept[version]
-        self.kept_bytes -= _own_bytes(kept.content)
+        self.kept_bytes -= own_bytes(kept.content)
         self._payloads.count(kept.content.datum, stays=-1)
         if found.is_held(version) or not found.stored:
             return
@@ -469,12 +464,12 @@ class History:
                 if index < len(found.states) - found.held:
                     loose += state.datum.size if state.datum is not None else 0
                 else:
-                    held += _own_bytes(state)
+                    held += own_bytes(state)
                     if state.datum is not None and state.datum.file:
                         payloads[slot.aspect] = payloads.get(slot.aspect, 0) + 1
             assert not found.held or found.queued, slot
             for version, one in found.kept.items():
-                kept += _own_bytes(one.content)
+                kept += own_bytes(one.content)
                 assert one.labels
                 for label in one.labels:
                     assert SlotVersion(slot, version) in self.labels[label]
@@ -484,13 +479,3 @@ class History:
         assert self.kept_bytes == kept
         named = {key for versions in self.labels.values() for key in versions}
         assert named == {SlotVersion(f.slot, version) for f in self for version in f.kept}
-
-
-def _own_bytes(content: Content) -> int:
-    """Return the bytes that a state holds in the memory of the shard alone, lineage included.
-
-    What a restart has found in a file is mapped, and read when it is asked for.
-    """
-    datum, cause = content.datum, content.cause
-    size = datum.size if datum is not None and not datum.file and datum.fault is None else 0
-    return size if cause is None or not cause.reads else size + cause_bytes(cause)

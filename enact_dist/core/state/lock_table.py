@@ -100,16 +100,18 @@ class _Queue:
     """Holders and waiters of one resource.
 
     Invariants: `held_modes[m]` counts `held` values; `pending[m]` is the not yet eligible part of
-    `waiting[m]`; all dicts are in ticket order.  A mode without any waiter so far has
-    `_NOBODY` in both, which stays empty.
+    `waiting[m]`, and `waiters` counts all of it; all dicts are in ticket order.  A mode without any
+    waiter so far has `_NOBODY` in both, which stays empty.
     """
 
     held: dict[LockId, Mode] = field(default_factory=dict)
     held_modes: list[int] = field(default_factory=_NO_HOLDERS.copy)
     waiting: list[dict[LockId, Claim]] = field(default_factory=_NO_WAITERS.copy)
     pending: list[dict[LockId, Claim]] = field(default_factory=_NO_WAITERS.copy)
+    waiters: int = 0
 
     def add_waiting(self, claim: Claim, mode: Mode, *, eligible: bool) -> None:
+        self.waiters += 1
         waiting = self.waiting[mode]
         if waiting is _NOBODY:
             self.waiting[mode] = {claim.lock: claim}
@@ -153,7 +155,7 @@ class _Queue:
         return min(tickets, default=_NO_LIMIT)
 
     def empty(self) -> bool:
-        return not self.held and not any(self.waiting)
+        return not self.held and not self.waiters
 
 
 _NO_LIMIT: Final = 1 << 63
@@ -191,24 +193,22 @@ class LockTable:
         self._ticket += 1
         claim = self.claims[lock] = Claim(lock, self._ticket, wants)
         queues, spare = self._queues, self._spare
-        waits: list[tuple[_Queue, Mode, bool]] = []
         for resource, mode in wants.items():
             queue = queues.get(resource)
             if queue is None:
-                queue = queues[resource] = spare.pop() if spare else _Queue()
-                eligible = True
-            else:
-                eligible = queue.admits(mode)
-                claim.blocked += not eligible
-            waits.append((queue, mode, eligible))
+                queues[resource] = spare.pop() if spare else _Queue()
+            elif not queue.admits(mode):
+                claim.blocked += 1
         if at_once and not claim.blocked and not self.ready:
             claim.granted = True
-            for queue, mode, _ in waits:
+            for resource in wants:
+                queue, mode = queues[resource], wants[resource]
                 queue.held[lock] = mode
                 queue.held_modes[mode] += 1
             return claim
-        for queue, mode, eligible in waits:
-            queue.add_waiting(claim, mode, eligible=eligible)
+        for resource, mode in wants.items():
+            queue = queues[resource]
+            queue.add_waiting(claim, mode, eligible=not claim.blocked or queue.admits(mode))
         if not claim.blocked:
             self.ready[lock] = claim
         return claim
@@ -226,6 +226,7 @@ class LockTable:
             for resource, mode in claim.wants.items():
                 queue = self._queues[resource]
                 del queue.waiting[mode][claim.lock]
+                queue.waiters -= 1
                 queue.held[claim.lock] = mode
                 queue.held_modes[mode] += 1
         return ready
@@ -235,24 +236,27 @@ class LockTable:
         claim = self.claims.pop(lock, None)
         if claim is None:
             return None
-        self.ready.pop(lock, None)
+        granted, queues = claim.granted, self._queues
+        if not granted:
+            self.ready.pop(lock, None)
         for resource, mode in claim.wants.items():
-            queue = self._queues[resource]
-            if claim.granted:
+            queue = queues[resource]
+            if granted:
                 del queue.held[lock]
                 queue.held_modes[mode] -= 1
             else:
                 del queue.waiting[mode][lock]
+                queue.waiters -= 1
                 queue.pending[mode].pop(lock, None)
-            if not queue.held and not any(queue.waiting):
-                del self._queues[resource]
-                if len(self._spare) < SPARE_MAX:
-                    self._spare.append(queue)
-            elif any(queue.pending):
+            if queue.waiters:
                 for eligible in queue.newly_eligible():
                     eligible.blocked -= 1
                     if not eligible.blocked:
                         self.ready[eligible.lock] = eligible
+            elif not queue.held:
+                del queues[resource]
+                if len(self._spare) < SPARE_MAX:
+                    self._spare.append(queue)
         return claim
 
     def writers_of(self, slot: Slot) -> list[LockId]:
@@ -310,6 +314,7 @@ class LockTable:
             modes = list(queue.held.values())
             for index, mode in enumerate(modes):
                 assert not any(m in CONFLICTS[mode] for m in modes[:index]), (resource, queue.held)
+            assert queue.waiters == sum(map(len, queue.waiting)), resource
             assert queue.held_modes == [modes.count(mode) for mode in Mode], resource
             assert not queue.empty(), resource
         for claim in self.claims.values():

@@ -16,13 +16,21 @@ from dataclasses import dataclass, field
 from itertools import islice
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.core.protocol.parts import CAUSE_COMMIT, Cause
 from enact_dist.core.state.due_times import DueTimes
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
 
     from enact_dist.core.protocol.datum import LockId, Token
-    from enact_dist.core.protocol.messages import Answer, Changed, Hello
+    from enact_dist.core.protocol.messages import (
+        Answer,
+        Changed,
+        Commit,
+        Hello,
+        Prepare,
+        SlotVersion,
+    )
     from enact_dist.core.protocol.records import OutcomeRecord, SessionRecord
 
 LANES_MAX: Final = 1024
@@ -94,6 +102,31 @@ class Session:
     act: tuple[int, Answer | None] = (0, None)
     identity: str = ""
 
+    def cause(
+        self,
+        message: Commit | Prepare,
+        versions: tuple[SlotVersion, ...],
+        stamp_ns: int,
+        held_ns: int,
+    ) -> Cause:
+        """Return the cause of what one of its locks, held for so long, is about to write.
+
+        The client says what it has read; who it is, and how long it has held the lock, the shard
+        knows itself.  All slots of a commit share the object.
+        """
+        return Cause(
+            message.lock,
+            CAUSE_COMMIT,
+            self.actor,
+            self.host,
+            self.pid,
+            stamp_ns,
+            held_ns,
+            message.reads,
+            message.reads_left_out,
+            versions,
+        )
+
     def lease_end_ns(self, now_ns: int) -> int:
         """Return when the lease ends if no further sign of life comes."""
         by_message = self.renewed_ns + self.ttl_ns
@@ -105,6 +138,13 @@ class Session:
     def idle_ns(self, now_ns: int) -> int:
         """Return from when on the session is forgotten if no further sign of life comes."""
         return self.lease_end_ns(now_ns) + IDLE_TTLS * self.ttl_ns + 1
+
+    def renew(self, now_ns: int, count: int) -> None:
+        """Take a message with this counter for a sign of life."""
+        if now_ns > self.renewed_ns:  # noqa: PLR1730 - as in `Stamps.next`
+            self.renewed_ns = now_ns
+        if count > self.count_seen:  # noqa: PLR1730 - as in `Stamps.next`
+            self.count_seen = count
 
     def lane(self, lane: int) -> Lane:
         """Return the lane, made on first use."""

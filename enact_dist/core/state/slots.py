@@ -21,9 +21,9 @@ from enact_dist.patterns import pattern_matches
 from enact_dist.terms import ACCESSES, NullReason
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Mapping
+    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
-    from enact_dist.core.protocol.messages import Item
+    from enact_dist.core.protocol.messages import Item, WriteItem
     from enact_dist.core.protocol.records import (
         AspectForgotten,
         KeptRecord,
@@ -132,10 +132,10 @@ class SlotMap:
         context, entity, aspect = slot
         return entity in self._columns.get((context, aspect), ())  # type: ignore[call-overload]
 
-    def exist(self, versions: Iterable[SlotVersion]) -> bool:
-        """Whether all these slots were ever written or are known to have been."""
+    def exist(self, writes: Iterable[WriteItem]) -> bool:
+        """Whether all slots that are to be written are there, or are known to have been."""
         columns = self._columns
-        for (context, entity, aspect), _ in versions:
+        for (context, entity, aspect), _ in writes:
             if entity not in columns.get((context, aspect), ()):  # type: ignore[call-overload]
                 return False
         return True
@@ -146,8 +146,13 @@ class SlotMap:
         In a context that was dropped before, or of an aspect that was forgotten, the first one lies
         above all that there was then.
         """
-        version = self[slot].version
-        return version + 1 if version else self._first_version(slot)
+        context, entity, aspect = slot
+        column = self._columns.get((context, aspect))  # type: ignore[call-overload]
+        if column is not None and entity in column:
+            version: int = column[entity].version
+            if version:
+                return version + 1
+        return self._first_version(slot)
 
     def version_base(self, context: str) -> int:
         """Return the largest version of a context, the nulls of a drop counted as versions."""
@@ -310,7 +315,7 @@ class SlotMap:
         old: Content = column.get(entity, NOTHING)
         before = old.datum.size if old.datum is not None else 0
         after = content.datum.size if content.datum is not None else 0
-        if max(before, after) >= LARGE_BYTES:
+        if before >= LARGE_BYTES or after >= LARGE_BYTES:
             self.large.change(slot, before=before, after=after)
         if old is NOTHING:
             self.count += 1
@@ -358,30 +363,36 @@ class SlotMap:
         slot = Slot(item.context, item.entity, item.aspect)
         return [(slot, self[slot])]
 
-    def shown(self, items: Iterable[Item], at_ns: int = 0) -> Shown:
+    def shown(self, items: Iterable[Item], at_ns: int = 0, *, named: Sequence[Slot] = ()) -> Shown:
         """Return what a grant or view shows of `items` as of a stamp (0: now).
 
         Slots are in order, with patterns expanded to slots that are not null.
+
+        Args:
+            items: What is asked for.
+            at_ns: As of when.
+            named: The slots of `items`, where the caller knows that none of these is a pattern.
         """
         states: list[SlotState] = []
         pins: dict[tuple[Slot, int], Datum] = {}
         from_ns, left = 0, self._answer_bytes_max
-        for item in items:
-            each = ACCESSES[item.access].each
-            slot = Slot(item.context, item.entity, item.aspect)
+        for index, item in enumerate(items):
+            each = not named and ACCESSES[item.access].each
+            slot = named[index] if named else Slot(item.context, item.entity, item.aspect)
             found = self._asked(item) if each else ((slot, self[slot]),)
             for slot, newest in found:
                 content = self.at(slot, newest, at_ns) if at_ns else newest
                 # Of the newest one as of then, too, where an older version is asked: what was
                 # captured when is certain only from its commit on.
-                from_ns = max(from_ns, content.stamp_ns)
+                if content.stamp_ns > from_ns:  # noqa: PLR1730 - as in `Stamps.next`
+                    from_ns = content.stamp_ns
                 if item.captured_ns:
                     content = self.captured(slot, content, item.captured_ns, nearest=item.nearest)
                 if content.datum is None and each:
                     continue
                 state = state_of(slot, content, known=item.known, inline_max=left)
                 left -= state.size if state.datum is not None and not state.large else 0
-                states.append(state)
+                states += (state,)
                 if content.datum is not None and (state.large or state.same):
                     pins[slot, state.version] = content.datum
         return Shown(states, pins, from_ns)
@@ -408,7 +419,7 @@ def state_of(
             slot, content.version, content.stamp_ns, 0, None, False, False, content.null_reason.name
         )
     same = with_datum and known == content.version > 0
-    large = datum.size > min(INLINE_BYTES_MAX, max(0, inline_max))
+    large = datum.size > INLINE_BYTES_MAX or 0 < datum.size > inline_max
     if same or not with_datum:
         shown = None
     else:
