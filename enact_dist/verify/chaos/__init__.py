@@ -1,6 +1,6 @@
 """Real daemons and real clients under real faults, judged by the same checker as the simulator.
 
-`runner` starts a cell whose hosts are network namespaces (`hosts`), lets client processes
+`runner` starts a cell whose hosts are network namespaces (`network`), lets client processes
 (`client`, `workload`) lock, read and write at random, and does to them what `faults` draws.  Each
 client keeps a `journal`; `evidence` turns the journals into a history for `verify.checker`;
 `figures` and `report` tell what happened; `command` is `enact verify --chaos`.
