@@ -314,10 +314,6 @@ class Lock(Triggered):
         state = self._readings.state(slot)
         return state is None or bool(state.null_reason)
 
-    def __setitem__(self, request: Write[T], datum: T) -> None:
-        """Set the datum when the block ends cleanly; see `put`."""
-        self.put(request, datum)
-
     def put(self, request: Write[T], datum: T, *, stamp_ns: int | None = None) -> None:
         """Set the datum when the block ends cleanly.
 
@@ -337,6 +333,8 @@ class Lock(Triggered):
             request = self._check_writable(request)
             found = slot_of(request), request.aspect, True
         self._put(found[0], found[1], datum, stamp_ns)
+
+    __setitem__ = put
 
     def _put(self, slot: Slot, aspect: Aspect[T], datum: T, stamp_ns: int | None) -> None:
         try:

@@ -111,7 +111,7 @@ class Session:
 
     def items_of(self, bound: BoundRequests) -> tuple[Item, ...]:
         """Return the protocol's lines for bound requests, with the versions that are cached."""
-        if self.cache.holds_none(bound.slots):
+        if self.cache.known.keys().isdisjoint(bound.slots):
             return bound.items
         return tuple(map(self.item_of, bound.requests))
 

@@ -21,6 +21,7 @@ Rules a change must keep
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import repeat, starmap
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.client.backoff import RETRY_NS_MAX, RETRY_NS_MIN
@@ -108,7 +109,7 @@ class MultiLock:
     _retry_ns: int = RETRY_NS_MIN
 
     def __post_init__(self) -> None:
-        self.parts = [Part(shard, items) for shard, items in self.plan.locks]
+        self.parts = list(starmap(Part, self.plan.locks))
         if self.plan.views:
             self.cut = Cut.of(self.plan, observer=self.client.observer)
         if not self.parts:
@@ -274,7 +275,7 @@ class MultiLock:
                 return  # a grant of an epoch that is over
             part.granted(answer, client.sendings, ttl_ns=client.ttl_ns)
             client.saw_stamp(answer.stamp_ns)
-            self.states += [Reading(shard, epoch, state) for state in answer.states]
+            self.states += map(Reading, repeat(shard), repeat(epoch), answer.states)
             if self.cut is not None:
                 self.cut.not_before(answer.from_ns)
             if part is parts[-1] and not self.plan.views:
@@ -414,7 +415,9 @@ class MultiLock:
         self._free_calls = self._retry_at_ns = 0
         expected = by_shard(expects, self.plan.placement) if expects else {}
         viewed = {shard: self._epoch_viewed(shard) for shard in expected} if expected else {}
-        written = {shard: tuple(items) for shard, items in writes.items() if items}
+        written = dict(zip(writes, map(tuple, writes.values()), strict=True))
+        if not all(written.values()):
+            written = {shard: items for shard, items in written.items() if items}
         tokens, reads = tokens_of(self.parts, viewed), tuple(reads)
         self._finishing = Finishing(self.lock, tokens, written, expected, reads, reads_left_out)
         self.phase = Phase.VALIDATING

@@ -49,38 +49,38 @@ class _Known(NamedTuple):
 
 
 class DatumCache:
-    """The newest datum of each slot that this process has seen, up to a byte limit."""
+    """The newest datum of each slot that this process has seen, up to a byte limit.
+
+    Attributes:
+        known: The data by slot; only this class changes them.
+    """
 
     def __init__(self, bytes_max: int = CACHE_BYTES_MAX) -> None:
         self._bytes_max = bytes_max
-        self._known: OrderedDict[Slot, _Known] = OrderedDict()
+        self.known: OrderedDict[Slot, _Known] = OrderedDict()
         self._bytes = 0
         self._mutex = threading.Lock()
 
     def __contains__(self, slot: Slot) -> bool:
-        return slot in self._known
-
-    def holds_none(self, slots: Iterable[Slot]) -> bool:
-        """Whether no datum of these slots is here."""
-        return self._known.keys().isdisjoint(slots)
+        return slot in self.known
 
     def version(self, slot: Slot, shard: str, epoch: int) -> int:
         """Return the known version of a slot in this epoch (0: none)."""
         with self._mutex:
-            known = self._known.get(slot)
+            known = self.known.get(slot)
         return known.version if known and (known.shard, known.epoch) == (shard, epoch) else 0
 
     def get(self, slot: Slot, shard: str, epoch: int, version: int) -> Datum | None:
         """Return the datum of exactly this version, if it is cached."""
         with self._mutex:
-            known = self._known.get(slot)
+            known = self.known.get(slot)
             if known is None or (known.shard, known.epoch, known.version) != (
                 shard,
                 epoch,
                 version,
             ):
                 return None
-            self._known.move_to_end(slot)
+            self.known.move_to_end(slot)
             return known.datum
 
     def put(self, slot: Slot, shard: str, epoch: int, version: int, datum: Datum) -> None:
@@ -91,16 +91,16 @@ class DatumCache:
         if not CACHED_BYTES_MIN <= datum.size <= self._bytes_max:
             return
         with self._mutex:
-            old = self._known.get(slot)
+            old = self.known.get(slot)
             if old is not None:
                 if (old.shard, old.epoch) == (shard, epoch) and version < old.version:
                     return
-                del self._known[slot]
+                del self.known[slot]
                 self._bytes -= old.datum.size
-            self._known[slot] = _Known(shard, epoch, version, datum)
+            self.known[slot] = _Known(shard, epoch, version, datum)
             self._bytes += datum.size
             while self._bytes > self._bytes_max:
-                _, dropped = self._known.popitem(last=False)
+                _, dropped = self.known.popitem(last=False)
                 self._bytes -= dropped.datum.size
 
 

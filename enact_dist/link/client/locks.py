@@ -101,7 +101,8 @@ class CellClient(SessionClient):
         items, begun = tuple(items), [] if begun is None else begun
         core, started_ns = self.core, self._now_ns()
         give_up_ns = started_ns + int(min(wait_s, CALLS_S_MAX) * 1e9)
-        self.renewal.used()
+        if started_ns >= self.renewal.used_until_ns:
+            self.renewal.used()
         lane, lock_views = self._lanes.take(), False
         try:
             for attempt in itertools.count():

@@ -126,6 +126,9 @@ class Renewal:
         mutex: Guards the session.
         pauses: Where the keep-alive thread pauses.
         now_ns: The session's clock.
+
+    Attributes:
+        used_until_ns: Until then the last note of a use counts for further ones.
     """
 
     def __init__(
@@ -140,7 +143,7 @@ class Renewal:
         self._pauses, self._now_ns = pauses, now_ns
         self._signs = SignsOfLife(random.random)
         self._rests_long = False
-        self._used_ns = -USED_AGAIN_NS
+        self.used_until_ns = 0
 
     def pause_s(self) -> float:
         """Return how long until the next keep-alive is due."""
@@ -162,10 +165,8 @@ class Renewal:
     def used(self) -> None:
         """Note that a lock begins, or that a thread waits for news from the shards."""
         now_ns = self._now_ns()
-        if now_ns < self._used_ns + USED_AGAIN_NS:
-            return  # noted already, and the keep-alive thread rests long only a TTL later
         with self._mutex:
-            self._used_ns = now_ns
+            self.used_until_ns = now_ns + USED_AGAIN_NS
             self._signs.used(now_ns, self._core.ttl_ns)
             rested_long, self._rests_long = self._rests_long, False
         if rested_long:
