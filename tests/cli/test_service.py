@@ -167,8 +167,8 @@ def test_up_drains_a_shard_as_its_table_says(write_cell, spawn, until):
             said = "".join(until(up, "down"))
             lock[piece] = 7
 
-    assert "still held when the drain of 0 s was over: slow@" in said
-    assert "--drain, or ENACT_SHARD_<NAME>_DRAIN_S, or drain_s in [shards.left]" in said
+    assert "still held when the drain of 0 s ended: slow@" in said
+    assert "--drain, ENACT_SHARD_<NAME>_DRAIN_S, or drain_s in [shards.left]" in said
 
 
 def test_drain_of_the_command_wins_over_that_of_the_file(write_cell, spawn, until):
