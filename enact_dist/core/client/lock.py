@@ -415,9 +415,7 @@ class MultiLock:
         self._free_calls = self._retry_at_ns = 0
         expected = by_shard(expects, self.plan.placement) if expects else {}
         viewed = {shard: self._epoch_viewed(shard) for shard in expected} if expected else {}
-        written = dict(zip(writes, map(tuple, writes.values()), strict=True))
-        if not all(written.values()):
-            written = {shard: items for shard, items in written.items() if items}
+        written = {shard: tuple(items) for shard, items in writes.items() if items}
         tokens, reads = tokens_of(self.parts, viewed), tuple(reads)
         self._finishing = Finishing(self.lock, tokens, written, expected, reads, reads_left_out)
         self.phase = Phase.VALIDATING
