@@ -118,7 +118,7 @@ class SlotRecord:
 class Content:
     """The committed state of one slot; replaced, never changed.
 
-    `bytes` is what `own_bytes` says of it, or -1 where nobody has counted yet.
+    `bytes` is what `own_bytes` says of it, or -1 as long as that has not been counted.
     """
 
     version: int
