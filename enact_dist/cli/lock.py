@@ -310,7 +310,7 @@ def list_audit(options: argparse.Namespace) -> Output:
         raise ConfigError("--acknowledge TEXT and --shard NAME go together")
     with open_cell(options) as cell:
         if options.acknowledge is not None:
-            cell.settle_alarms(shard=options.shard, how=options.acknowledge)
+            cell.acknowledge_alarms(shard=options.shard, how=options.acknowledge)
         shards, status = in_reach(cell)
         entries = cell.audit(shards)
     rows = [

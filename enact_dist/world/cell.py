@@ -11,7 +11,7 @@ import contextlib
 import time
 import warnings
 import weakref
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.access.arguments import check_reason
 from enact_dist.access.asking import ask_all, await_stamp
@@ -63,6 +63,15 @@ _open: weakref.WeakKeyDictionary[CellClient, Any] = weakref.WeakKeyDictionary()
 
 Handles of a cell keep working after the program has dropped its last reference to the cell.
 """
+
+
+_FORMER: Final = {
+    "keep": "pin",
+    "kept": "pinned",
+    "let_go": "unpin",
+    "settle_alarms": "acknowledge_alarms",
+}
+"""Methods by the names that they had in the release before."""
 
 
 class Cell(Closing):
@@ -188,21 +197,6 @@ class Cell(Closing):
         """
         self._client.check_usable()
         unpin_versions(self._session, label)
-
-    def keep(self, label: str, versions: Iterable[Version[Any] | Made]) -> None:
-        """Pin versions.  Deprecated: use `pin`."""
-        _renamed("keep", "pin")
-        self.pin(label, versions)
-
-    def kept(self) -> dict[str, tuple[Version[Any], ...]]:
-        """Return the pinned versions.  Deprecated: use `pinned`."""
-        _renamed("kept", "pinned")
-        return self.pinned()
-
-    def let_go(self, label: str) -> None:
-        """Unpin versions.  Deprecated: use `unpin`."""
-        _renamed("let_go", "unpin")
-        self.unpin(label)
 
     def wait(self, position: Position, *, timeout_s: float = 10.0) -> bool:
         """Wait until all commits up to `position` are visible; say whether they are.
@@ -364,7 +358,7 @@ class Cell(Closing):
         ]
         return tuple(sorted(found, key=lambda entry: entry.stamp_s))
 
-    def settle_alarms(self, *, shard: str, how: str) -> None:
+    def acknowledge_alarms(self, *, shard: str, how: str) -> None:
         """Acknowledge all alarms of a shard so far; the shard audits the act.
 
         Raises:
@@ -481,13 +475,19 @@ class Cell(Closing):
                 self._host.close()
                 self._host = None
 
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> object:
+            """Find a method by its former name, for this release, with a warning."""
+            new = _FORMER.get(name)
+            if new is None:
+                raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+            text = f"Cell.{name} is now Cell.{new}"
+            warnings.warn(text, DeprecationWarning, stacklevel=2)
+            return getattr(self, new)
+
     def __repr__(self) -> str:
         return f"<cell {self.name!r}, {len(self._client.shards())} shards>"
-
-
-def _renamed(old: str, new: str) -> None:
-    """Warn of a method that has another name since this release; the next one drops the old."""
-    warnings.warn(f"Cell.{old} is now Cell.{new}", DeprecationWarning, stacklevel=3)
 
 
 def _close_all() -> None:

@@ -64,16 +64,12 @@ def connect(
     from enact_dist.link.zenoh.config import OPEN_S
 
     if patience_s is not None:
-        warnings.warn(
-            "connect(patience_s=…) is now connect(request_timeout_s=…)",
-            DeprecationWarning,
-            stacklevel=2,
-        )
+        text = "connect(patience_s=…) is now connect(request_timeout_s=…)"
+        warnings.warn(text, DeprecationWarning, stacklevel=2)
         request_timeout_s = patience_s
     for word, waits_s in (("timeout_s", timeout_s), ("request_timeout_s", request_timeout_s)):
         check_seconds(word, waits_s)
-    name, ttl_s = "", TTL_S
-    carrier = carrier_of(os.environ)
+    name, ttl_s, carrier = "", TTL_S, carrier_of(os.environ)
     endpoints: tuple[str, ...] = (str(target),)
     expected: tuple[ShardEntry, ...] = ()
     if not _is_endpoint(target):

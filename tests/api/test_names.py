@@ -25,7 +25,7 @@ def test_reason_is_one_line_of_some_length(cell, reason, says):
     for act in (
         lambda: cell.break_lock(1, shard="local", reason=reason),
         lambda: cell.force_abort(1, shard="local", reason=reason),
-        lambda: cell.settle_alarms(shard="local", how=reason),
+        lambda: cell.acknowledge_alarms(shard="local", how=reason),
     ):
         with pytest.raises(MisuseError, match=says):
             act()

@@ -218,7 +218,7 @@ class TestNearest:
         answer = as_of(bench, 0, item(V)._replace(nearest=True))
 
         assert isinstance(answer, Refused)
-        assert "nearest to no stamp" in answer.text
+        assert "nearest to no capture stamp" in answer.text
 
 
 @settings(max_examples=150, deadline=None)

@@ -128,8 +128,8 @@ def test_deciding_shard_that_comes_back_with_a_commit_raises_an_alarm(cell, monk
         seen = joined.world("online").view(*views)
         assert [seen[view] for view in views] == [1, 0], "torn, as the alarm says"
 
-    assert cell.enact("lock", "audit", "--settle", "mended").returncode == 2, "of which shard?"
-    done = cell.enact("lock", "audit", "--settle", "right written again", "--shard", "s1")
+    assert cell.enact("lock", "audit", "--acknowledge", "mended").returncode == 2, "of which shard?"
+    done = cell.enact("lock", "audit", "--acknowledge", "right written again", "--shard", "s1")
     assert done.returncode == 0
     assert "ALARMS" not in cell.enact("shard", "ls").stdout
     assert audited(cell)[-1] == ("s1", "settled")
