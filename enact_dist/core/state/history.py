@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.records import Content
 
 LOOSE_NS: Final = 2_000_000_000
-"""How long any replaced state is kept, on the clock of the stamps; older ones go with a tick."""
+"""How long any replaced state is kept, on the clock of the stamps."""
 LOOSE_BYTES_MAX: Final = 64 << 20
 """Bytes of data, payloads included, that only this keeps."""
 LOOSE_STATES_MAX: Final = 50_000
@@ -133,7 +133,11 @@ class History:
         recent = self._recent
         recent.append((until_ns, found))
         self._append(found, old, policy.limits)
-        if self._loose_bytes > LOOSE_BYTES_MAX or len(recent) > LOOSE_STATES_MAX:
+        if (
+            recent[0][0] < until_ns - LOOSE_NS
+            or self._loose_bytes > LOOSE_BYTES_MAX
+            or len(recent) > LOOSE_STATES_MAX
+        ):
             self._end_recent(until_ns - LOOSE_NS)
         if self.count > HELD_STATES_MAX or self.bytes > self._bytes_max:
             self._fit()
