@@ -45,10 +45,11 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from types import TracebackType
 
+    from enact_dist.access.session import Session
     from enact_dist.access.writes import DTypesLike, ShapesLike
     from enact_dist.core.client.lock import MultiLock
     from enact_dist.core.protocol.datum import Position, Slot
-    from enact_dist.core.protocol.messages import Item
+    from enact_dist.core.protocol.messages import DatumRead, Item
     from enact_dist.terms import (
         Aspect,
         LockRequest,
@@ -62,6 +63,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 R = TypeVar("R", bound="LockRequest[Any]")
 
+_NO_READS: tuple[tuple[DatumRead, ...], int] = (), 0
 _thread = threading.local()
 
 
@@ -120,7 +122,9 @@ class Lock(Triggered):
             check_seconds("wait_s", wait_s)
         if type(hold_s) is not float or not 0.0 < hold_s <= HOLD_S_MAX:
             check_hold("hold_s", hold_s)
-        self._session, self._requests = self._bound.session, self._bound.requests
+        self._kept = requests  # so that the ids in `_bound` stay theirs
+        self._requests = dict(zip(requests, requests, strict=True))
+        self._session: Session = requests[0].world.session  # type: ignore[attr-defined]  # bound
         self._wait_s, self._hold_s = wait_s, hold_s
         self._lock: MultiLock | None = None
         self._asking = self._over = False
@@ -146,7 +150,7 @@ class Lock(Triggered):
         if self._lock is not None or self._asking:
             raise LockReleasedError(f"{self!r} was used already; make a new lock")
         session, client = self._session, self._session.client
-        prepared = session.prepare_bound(self._bound, wait_s=self._wait_s)
+        prepared = session.prepare_bound(self._bound, self._requests, wait_s=self._wait_s)
         begun: list[MultiLock] = []
         self._asked_s = time.monotonic()
         try:
@@ -175,7 +179,7 @@ class Lock(Triggered):
         return self
 
     def _items(self) -> tuple[Item, ...]:
-        return self._session.items_of(self._bound)
+        return self._session.items_of(self._bound, self._requests)
 
     def __exit__(
         self,
@@ -200,7 +204,9 @@ class Lock(Triggered):
                 self._writing.fix()
                 only = lock.parts[0].shard if len(lock.parts) == 1 else ""
                 writes = self._writing.by_shard(lock.shard_of, only)
-                reads = reads_of(self._readings, self._bound.reads if writes else (), self._each)
+                reads = _NO_READS
+                if writes:
+                    reads = reads_of(self._readings, self._bound.reads, self._each)
                 client.finish(lock, writes, tuple(self._expects.values()), *reads)
                 self.position = lock.position
         finally:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import weakref
 from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.access.asking import await_stamp
@@ -49,27 +50,26 @@ LOOKED_UP_S: Final = 1.0
 class BoundRequests:
     """What the requests of a lock mean to a session, worked out once for each set of them.
 
+    It refers to no request and no session: a session that is dropped ends at once.
+
     Args:
-        session: The session of all of them.
         requests: The requests, checked.
 
     Attributes:
-        requests: Each request by itself.
         single: For each request of one entity, by its `id`: its slot, aspect, and whether it allows
-            writing.  The requests are kept here, so their ids stay theirs.
+            writing.  Valid while whoever uses it keeps the requests.
         reads: The slots of those that show one datum and do not write it.
         items: The lines of the protocol, as asked for while no datum is cached.
         known_at: The state of the catalogues in which all aspects were found settled.
     """
 
-    __slots__ = ("items", "known_at", "reads", "requests", "session", "single", "slots")
+    __slots__ = ("_alive", "items", "known_at", "reads", "single", "slots")
 
-    def __init__(self, session: Session, requests: tuple[LockRequest[Any], ...]) -> None:
-        self.session = session
-        self.requests = dict(zip(requests, requests, strict=True))
+    def __init__(self, requests: tuple[LockRequest[Any], ...]) -> None:
         self.single: dict[int, tuple[Slot, Aspect[Any], bool]] = {}
+        self._alive: list[weakref.ref[LockRequest[Any]]] = []
         items = []
-        for request in self.requests:
+        for request in dict.fromkeys(requests):
             items.append(Item(int(request.access), *request.address))
             if not request.access.each:
                 slot = slot_of(request)
@@ -78,6 +78,23 @@ class BoundRequests:
         self.slots = [slot for slot, _, _ in self.single.values()]
         self.reads = [slot for slot, _, writable in self.single.values() if not writable]
         self.known_at: object = None
+
+    def remember(
+        self, requests: tuple[LockRequest[Any], ...], bound: dict[tuple[int, ...], BoundRequests]
+    ) -> None:
+        """Enter this into the sets that a session remembers, until one of the requests is freed.
+
+        Another object may then have its id.
+        """
+        key = tuple(map(id, requests))
+
+        def drop(_: object) -> None:
+            bound.pop(key, None)
+
+        if len(bound) >= BOUND_MAX:
+            bound.clear()
+        self._alive = [weakref.ref(request, drop) for request in requests]
+        bound[key] = self
 
 
 class Session:
@@ -97,23 +114,27 @@ class Session:
         self._lapses = 0
         self.unknown: set[AspectEntry] = set()
 
-    def prepare_bound(self, bound: BoundRequests, *, wait_s: float) -> int:
+    def prepare_bound(
+        self, bound: BoundRequests, requests: Iterable[LockRequest[Any]], *, wait_s: float
+    ) -> int:
         """`prepare` for the requests of a lock; at once where the catalogues have not changed."""
-        client = self.client
-        catalogue = client.catalogue
+        client, catalogue = self.client, self.client.catalogue
+        lapses = catalogue.lapses  # first: a lapse after this is seen by `check_shown`'s caller
         state = catalogue.state
         if bound.known_at is state and state[0] is client.core.placement:
-            return catalogue.lapses
-        prepared = self.prepare(bound.requests, wait_s=wait_s)
-        if client.knows(self._entries_of(bound.requests)[0]):
+            return lapses
+        prepared = self.prepare(requests, wait_s=wait_s)
+        if client.knows(self._entries_of(requests)[0]):
             bound.known_at = state  # as it was before: a change meanwhile is looked at next time
         return prepared
 
-    def items_of(self, bound: BoundRequests) -> tuple[Item, ...]:
+    def items_of(
+        self, bound: BoundRequests, requests: Iterable[LockRequest[Any]]
+    ) -> tuple[Item, ...]:
         """Return the protocol's lines for bound requests, with the versions that are cached."""
         if self.cache.known.keys().isdisjoint(bound.slots):
             return bound.items
-        return tuple(map(self.item_of, bound.requests))
+        return tuple(map(self.item_of, requests))
 
     def prepare(self, requests: Iterable[LockRequest[Any]], *, wait_s: float | None = None) -> int:
         """Make sure that the aspects of a lock or view can be used: register what it may write.
@@ -285,6 +306,7 @@ class Session:
         if known is None or known[0] is not aspect:
             if len(self._entries) >= ENTRIES_MAX:
                 self._entries.clear()  # for programs that make a new aspect for each lock
+                self.bound.clear()  # so that the aspects of every set are entered again
             durability = aspect.durability.value if aspect.durability is not None else ""
             entry = AspectEntry(
                 aspect.name,
@@ -405,11 +427,9 @@ def bind(requests: tuple[LockRequest[Any], ...]) -> BoundRequests:
         refuse_duplicates(requests)
     except ValueError as error:
         raise MisuseError(str(error)) from None
-    bound = BoundRequests(session, requests)
+    bound = BoundRequests(requests)
     if len(requests) <= BOUND_ITEMS_MAX:
-        if len(session.bound) >= BOUND_MAX:
-            session.bound.clear()
-        session.bound[tuple(map(id, requests))] = bound
+        bound.remember(requests, session.bound)
     return bound
 
 

@@ -143,9 +143,11 @@ def _shard(
     """Return a shard with its overrides; the cell's data folder was `before` and is `now`."""
     if shard.folder == (before and before / shard.name):
         shard = dataclasses.replace(shard, folder=now and now / shard.name)
-    new = _overridden(shard, lambda key: variable_of(shard.name, key), ours)
-    if shard.advertise == shard.listen and new.advertise == shard.advertise:
+    if shard.advertise == shard.listen:
         # An advertised endpoint that was only the default follows the new one.
+        shard = dataclasses.replace(shard, advertise=())
+    new = _overridden(shard, lambda key: variable_of(shard.name, key), ours)
+    if not new.advertise:
         new = dataclasses.replace(new, advertise=new.listen)
     if any(is_wildcard(endpoint) for endpoint in new.advertise):
         raise ConfigError(

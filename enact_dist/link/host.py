@@ -341,7 +341,8 @@ class ShardHost:
             self._handle_now(message, handle, identity)
 
     def _handle_now(self, message: Request | Event, handle: int, identity: str) -> None:
-        clock, later = self._clock, list[Publish | Story]()
+        clock = self._clock
+        later: list[Publish | Story] = []
         try:
             for effect in self._shard.handle(
                 message,

@@ -9,9 +9,8 @@ from __future__ import annotations
 import atexit
 import contextlib
 import time
-import warnings
 import weakref
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from enact_dist.access.arguments import check_reason
 from enact_dist.access.asking import ask_all, await_stamp
@@ -33,7 +32,7 @@ from enact_dist.core.protocol.messages import (
 )
 from enact_dist.errors import EnactError, MisuseError
 from enact_dist.link.client.dropped import when_dropped
-from enact_dist.terms import checked_name
+from enact_dist.terms import FormerNames, checked_name
 from enact_dist.world.context import WorldContext
 from enact_dist.world.forks import drop_world
 from enact_dist.world.lineage import CauseTree, EffectTree, tree_of
@@ -51,7 +50,7 @@ from enact_dist.world.listings import (
 from enact_dist.world.pins import pin_versions, pinned_versions, unpin_versions
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
     from enact_dist.link.client.locks import CellClient
     from enact_dist.terms import Aspect, Entity
@@ -65,16 +64,7 @@ Handles of a cell keep working after the program has dropped its last reference 
 """
 
 
-_FORMER: Final = {
-    "keep": "pin",
-    "kept": "pinned",
-    "let_go": "unpin",
-    "settle_alarms": "acknowledge_alarms",
-}
-"""Methods by the names that they had in the release before."""
-
-
-class Cell(Closing):
+class Cell(FormerNames, Closing):
     """A connection to a cell.  Use as a context manager, or `close` it.
 
     A cell left open does not block the interpreter's exit.  Once neither a cell nor what it made is
@@ -85,6 +75,14 @@ class Cell(Closing):
     Connect for the first time after the fork, or start the child with
     ``multiprocessing.get_context("spawn")``.  `local` works in both.
     """
+
+    former: ClassVar[Mapping[str, str]] = {
+        "keep": "pin",
+        "kept": "pinned",
+        "let_go": "unpin",
+        "namesakes": "sessions_named",
+        "settle_alarms": "acknowledge_alarms",
+    }
 
     def __init__(self, name: str, client: CellClient, *, host: Any = None) -> None:
         self.name = name
@@ -474,17 +472,6 @@ class Cell(Closing):
             if self._host is not None and not self._client.forked:
                 self._host.close()
                 self._host = None
-
-    if not TYPE_CHECKING:
-
-        def __getattr__(self, name: str) -> object:
-            """Find a method by its former name, for this release, with a warning."""
-            new = _FORMER.get(name)
-            if new is None:
-                raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-            text = f"Cell.{name} is now Cell.{new}"
-            warnings.warn(text, DeprecationWarning, stacklevel=2)
-            return getattr(self, new)
 
     def __repr__(self) -> str:
         return f"<cell {self.name!r}, {len(self._client.shards())} shards>"

@@ -14,7 +14,7 @@ A history carries no data: `Version.datum` fetches one.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar, overload
 
 from enact_dist.access.arguments import (
     Moment,
@@ -33,13 +33,13 @@ from enact_dist.access.watch import Watch
 from enact_dist.core.protocol.datum import Position, Slot
 from enact_dist.errors import ForgottenError, MisuseError
 from enact_dist.link.refusals import moment_name
-from enact_dist.terms import Aspect, Entities, Entity, View, Write
+from enact_dist.terms import Aspect, Entities, Entity, FormerNames, View, Write
 from enact_dist.wire.payload import decode_untyped
 from enact_dist.world.forks import fork_world
 from enact_dist.world.past import CellContext, PastContext
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
     from enact_dist.access.together import Together
     from enact_dist.compare.two_worlds import Viewable
@@ -270,7 +270,7 @@ class WorldContext(CellContext):
 
 
 @dataclass(frozen=True, slots=True)
-class Version(Generic[T]):
+class Version(FormerNames, Generic[T]):
     """One version of a datum, without it.
 
     Attributes:
@@ -299,6 +299,7 @@ class Version(Generic[T]):
     null_reason: str
     pinned: tuple[str, ...]
     cause: Cause | None
+    former: ClassVar[Mapping[str, str]] = {"kept": "pinned"}
 
     @classmethod
     def of(

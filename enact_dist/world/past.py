@@ -30,10 +30,10 @@ from enact_dist.access.snapshot import (
 from enact_dist.core.protocol.messages import Item
 from enact_dist.errors import MisuseError
 from enact_dist.link.refusals import moment_name
-from enact_dist.terms import Access, Context, Entities, Entity
+from enact_dist.terms import Access, Context, Entities, Entity, FormerNames
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
     from enact_dist.access.arguments import Moment
     from enact_dist.access.session import Session
@@ -44,10 +44,11 @@ if TYPE_CHECKING:
     from enact_dist.terms import Aspect, LockRequest
 
 
-class CellContext(Context):
+class CellContext(FormerNames, Context):
     """A world context of a cell, present or past: its slots, data without a type, differences."""
 
     __slots__ = ("session",)
+    former: ClassVar[Mapping[str, str]] = {"raw": "get_untyped", "survey": "list_slots"}
 
     def __init__(self, name: str, session: Session) -> None:
         super().__init__(name)

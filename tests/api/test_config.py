@@ -384,6 +384,15 @@ def test_environment_overrides_the_file():
     assert (left.drain_s, right.drain_s) == (0.0, 30.0)
 
 
+@pytest.mark.parametrize("listen", ["tcp/0.0.0.0:7447", "tcp/10.0.0.1:7447"])
+def test_advertised_endpoint_may_be_the_one_of_the_file(listen):
+    """As in a container: listen on every address, and be known by the name as before."""
+    known = "tcp/127.0.0.1:7447"
+    config = parsed(FULL, ENACT_SHARD_LEFT_LISTEN=listen, ENACT_SHARD_LEFT_ADVERTISE=known)
+
+    assert (config.shard("left").listen, config.shard("left").advertise) == ((listen,), (known,))
+
+
 def test_data_folder_override_leaves_a_folder_of_its_own():
     """A shard whose folder is written in the file stays there."""
     assert parsed(FULL, ENACT_DATA_FOLDER="/var").shard("right").folder == Path("/srv/right")

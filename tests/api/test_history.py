@@ -184,6 +184,23 @@ def test_old_names_of_pins_warn_and_work(cell, online):
     assert cell.pinned() == {}
 
 
+def test_other_former_names_warn_and_work(cell, online):
+    """Of contexts, versions and cells; what never was a name is no attribute."""
+    online.init(ARM, COUNT, 1)
+    with pytest.warns(DeprecationWarning, match=r"WorldContext\.raw is now .*get_untyped"):
+        assert online.raw(ARM, "count") == 1
+    with pytest.warns(DeprecationWarning, match=r"WorldContext\.survey is now .*list_slots"):
+        assert online.survey() == online.list_slots()
+    (version,) = online.history(ARM, COUNT)
+    with pytest.warns(DeprecationWarning, match=r"Version\.kept is now Version\.pinned"):
+        assert version.kept == ()
+    with pytest.warns(DeprecationWarning, match=r"Cell\.namesakes is now Cell\.sessions_named"):
+        assert cell.namesakes("nobody") == cell.sessions_named("nobody")
+    for one in (cell, online, version):
+        with pytest.raises(AttributeError, match="no attribute 'colour'"):
+            one.colour  # noqa: B018
+
+
 def test_versions_of_several_shards_are_kept_under_one_label(two_stored):
     """And outlive a restart of their shard."""
     cell, online = two_stored.cell, two_stored.cell.world("online")

@@ -31,6 +31,11 @@ def counted(paths):
                 first = node.args[0]
                 if called in CALLS and isinstance(first, ast.Constant):
                     names.add(first.value)
+            elif isinstance(node, ast.AugAssign) and isinstance(node.target, ast.Subscript):
+                table, key = node.target.value, node.target.slice
+                named = getattr(table, "attr", "").lstrip("_") == "counters"
+                if named and isinstance(key, ast.Constant):
+                    names.add(key.value)
     return {name for name in names if isinstance(name, str)}
 
 

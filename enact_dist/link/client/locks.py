@@ -360,7 +360,7 @@ class CellClient(SessionClient):
         if lock.lane_free:
             return
         try:
-            if lock.phase.busy or lock.phase is Phase.HELD:
+            if lock.phase is not Phase.COMMITTED:  # which only this thread can bring about
                 with self._mutex:
                     lock.release()
             if lock.farewells:
