@@ -8,8 +8,7 @@ from shard_bench import slot
 
 from enact_dist.core.protocol.datum import Datum
 from enact_dist.core.protocol.records import Content
-from enact_dist.core.state.large_slots import LARGE_BYTES, LOOKED_MAX, LargeSlots
-from enact_dist.core.state.slots import SlotMap
+from enact_dist.core.state.slots import LARGE_BYTES, LOOKED_MAX, LargeSlots, SlotMap
 from enact_dist.terms import NullReason
 
 SIZES = st.integers(0, 8 * LARGE_BYTES) | st.sampled_from([0, LARGE_BYTES - 1, LARGE_BYTES])

@@ -18,7 +18,7 @@ from enact_dist.core.protocol.messages import (
     WriteItem,
 )
 from enact_dist.core.protocol.records import SessionSeen, Tick
-from enact_dist.core.state.due_times import STALE_MAX, DueTimes
+from enact_dist.core.state.clock import STALE_MAX, DueTimes
 from enact_dist.core.state.sessions import IDLE_TTLS, Session
 from enact_dist.terms import Access
 

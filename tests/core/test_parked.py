@@ -26,7 +26,7 @@ from enact_dist.core.protocol.messages import (
     Waiting,
 )
 from enact_dist.core.protocol.records import Drain, Tick
-from enact_dist.core.shard.parked import OF_A_SESSION_MAX
+from enact_dist.core.shard.on_view import OF_A_SESSION_MAX
 from enact_dist.terms import Access
 
 ANN = lock_id("ann")
@@ -204,7 +204,7 @@ def waiting(bench: ShardBench, session: str, number: int, *items: Item) -> Answe
 
 def test_requests_of_one_identity_that_wait_are_bounded(bench, monkeypatch):
     """A few locks of thousands of requests each are as bad as thousands of locks."""
-    monkeypatch.setattr("enact_dist.core.shard.quotas.ITEMS_WAITING_MAX", 5)
+    monkeypatch.setattr("enact_dist.core.shard.owners.ITEMS_WAITING_MAX", 5)
     for session in ("dora", "dan"):
         bench.ask_as("d", Hello(session, 0, 2 * S, session, "host", 1, False))
     holder = bench.granted(lock_id("ann", 9), item(W))

@@ -6,7 +6,7 @@ from shard_bench import MS, S, ShardBench, item, lock_id
 
 from enact_dist.core.protocol.messages import Goodbye, Granted, Hello, KeepAlive, Refused, Welcome
 from enact_dist.core.protocol.records import SessionSeen
-from enact_dist.core.shard import quotas
+from enact_dist.core.shard import owners
 from enact_dist.core.state import sessions
 from enact_dist.terms import Access
 
@@ -20,7 +20,7 @@ def hello(session, *, observer=True):
 def test_process_with_all_its_sessions_is_refused_and_the_others_get_in():
     """By name, counted, told to the log once; what it ends it may open again."""
     bench = ShardBench()
-    opened = [bench.ask_as(GREEDY, hello(f"s{n}")) for n in range(quotas.SESSIONS_MAX)]
+    opened = [bench.ask_as(GREEDY, hello(f"s{n}")) for n in range(owners.SESSIONS_MAX)]
     refused = [bench.ask_as(GREEDY, hello(f"more{n}")) for n in range(3)]
     again = bench.ask_as(GREEDY, hello("s0"))
     other = bench.ask_as(MODEST, hello("mine"))
@@ -47,7 +47,7 @@ def test_two_hundred_clients_of_one_name_on_one_host_are_as_many_shares():
 def test_recovered_sessions_count_for_their_identity():
     """A restart is no way to get more."""
     bench = ShardBench()
-    for number in range(quotas.SESSIONS_MAX):
+    for number in range(owners.SESSIONS_MAX):
         bench.ask_as(GREEDY, hello(f"s{number}", observer=False))
     bench.restart()
 
@@ -117,7 +117,7 @@ def test_table_that_was_full_before_a_restart_keeps_nobody_out_after_it(monkeypa
 
 def test_process_with_all_its_locks_is_refused_and_the_others_are_granted(monkeypatch):
     """Held and awaited ones count together, over all its sessions; asking again does not."""
-    monkeypatch.setattr(quotas, "WAITERS_MAX", 6)
+    monkeypatch.setattr(owners, "WAITERS_MAX", 6)
     bench = ShardBench()
     bench.ask_as(GREEDY, hello("s0", observer=False))
     bench.ask_as(GREEDY, hello("s1", observer=False))
@@ -143,5 +143,5 @@ def test_process_with_all_its_locks_is_refused_and_the_others_are_granted(monkey
 
 def test_bounds_leave_room_for_any_program():
     """A session has at most so many threads; a table holds many shares."""
-    assert quotas.WAITERS_MAX >= 2 * sessions.LANES_MAX
-    assert quotas.SESSIONS_MAX * 10 < sessions.SESSIONS_MAX
+    assert owners.WAITERS_MAX >= 2 * sessions.LANES_MAX
+    assert owners.SESSIONS_MAX * 10 < sessions.SESSIONS_MAX

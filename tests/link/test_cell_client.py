@@ -8,7 +8,7 @@ import pytest
 
 from enact_dist import Aspect, Durability, Entity, Lock, Read, View, Write, connect
 from enact_dist.core.protocol.messages import ListSessions, Pin, PlacementMap, ShardEntry
-from enact_dist.core.shard import quotas
+from enact_dist.core.shard import owners
 from enact_dist.core.shard.state import ShardSettings
 from enact_dist.errors import LinkError, MisuseError, ProtocolError, ShardUnreachableError
 from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
@@ -381,7 +381,7 @@ def test_shard_that_refuses_the_greeting_is_asked_once_and_its_reason_told(two, 
     two.start("b")
     with two.connect() as cell:
         online = cell.world("online")
-        monkeypatch.setattr(quotas, "SESSIONS_MAX", 0)
+        monkeypatch.setattr(owners, "SESSIONS_MAX", 0)
         refused = pytest.raises(LinkError, match="has 0 sessions at this shard")
         with refused, Lock(Write(online, there, COUNT)):
             pass

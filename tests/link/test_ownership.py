@@ -8,7 +8,7 @@ import zenoh
 
 from enact_dist.core.protocol import messages as m
 from enact_dist.core.protocol.datum import Datum, LockId, Position, Slot
-from enact_dist.core.shard import owners, parked, quotas
+from enact_dist.core.shard import on_view, owners
 from enact_dist.core.state import sessions
 from enact_dist.errors import PermissionDeniedError, ProtocolError
 from enact_dist.link.memory import payload_desk
@@ -283,11 +283,11 @@ def test_page_on_security_says_the_bounds_that_hold():
     """Each figure of its table is that of the code."""
     rows = dict(re.findall(r"^\| ([^|]+) \| ([^|]+) \|", PAGE.read_text("utf-8"), re.MULTILINE))
     held = {
-        "sessions of one process": quotas.SESSIONS_MAX,
+        "sessions of one process": owners.SESSIONS_MAX,
         "sessions of a shard": sessions.SESSIONS_MAX,
-        "locks that one process holds or awaits": quotas.WAITERS_MAX,
+        "locks that one process holds or awaits": owners.WAITERS_MAX,
         "socket connections": socket_service.PROCESS_CONNECTIONS_MAX,
-        "waiting questions": parked.OF_A_SESSION_MAX,
+        "waiting questions": on_view.OF_A_SESSION_MAX,
         "one message": FRAME_BYTES_MAX >> 20,
         "data sent with their commit": COMMIT_BYTES_MAX >> 20,
     }

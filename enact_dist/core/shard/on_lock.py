@@ -20,7 +20,7 @@ from enact_dist.core.protocol.messages import (
     WrongShard,
 )
 from enact_dist.core.protocol.records import Effect, Reply
-from enact_dist.core.shard import quotas
+from enact_dist.core.shard import owners
 from enact_dist.core.state.grants import Shape, shape_of
 from enact_dist.core.state.sessions import LANES_MAX, Lane, Session
 from enact_dist.terms import ACCESSES
@@ -110,13 +110,13 @@ class LockDesk:
         elif lock.seq <= lanes[lock.lane].top:
             state.count("stale")
             return [Reply(reply_to, Stale(lock, state.epoch))]
-        if len(tenures.by_lock) >= quotas.WAITERS_MAX and self._has_its_share(session):
-            bound = f"{quotas.WAITERS_MAX} locks held or awaited"
+        if len(tenures.by_lock) >= owners.WAITERS_MAX and self._has_its_share(session):
+            bound = f"{owners.WAITERS_MAX} locks held or awaited"
             return state.quotas.refuse(reply_to, session.identity, bound)
         if session.identity and tenures.waiting_of.get(session.identity, 0) >= (
-            quotas.ITEMS_WAITING_MAX
+            owners.ITEMS_WAITING_MAX
         ):
-            bound = f"{quotas.ITEMS_WAITING_MAX} requests in locks that wait"
+            bound = f"{owners.ITEMS_WAITING_MAX} requests in locks that wait"
             return state.quotas.refuse(reply_to, session.identity, bound)
         if lock.lane not in lanes:
             lanes[lock.lane] = Lane()
@@ -139,7 +139,7 @@ class LockDesk:
             return False
         tenures = self._state.tenures
         mine = self._state.sessions.of(session.identity)
-        return sum(len(tenures.by_session.get(one, ())) for one in mine) >= quotas.WAITERS_MAX
+        return sum(len(tenures.by_session.get(one, ())) for one in mine) >= owners.WAITERS_MAX
 
     def _supersede(self, lock: LockId) -> Iterator[Effect]:
         """A newer lock of a lane ends the older ones: their release was lost."""

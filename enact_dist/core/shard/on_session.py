@@ -34,7 +34,7 @@ from enact_dist.core.protocol.records import (
     Story,
     WorldRecord,
 )
-from enact_dist.core.shard import quotas
+from enact_dist.core.shard import owners
 from enact_dist.core.shard.inspection import REPORT_BYTES_MAX
 from enact_dist.terms import Durability
 
@@ -62,8 +62,8 @@ class SessionDesk:
         known = self._state.sessions.by_id.get(message.session)
         if known is None:
             sessions, asker = self._state.sessions, self._state.asker
-            if asker and len(sessions.of(asker)) >= quotas.SESSIONS_MAX:
-                bound = f"{quotas.SESSIONS_MAX} sessions"
+            if asker and len(sessions.of(asker)) >= owners.SESSIONS_MAX:
+                bound = f"{owners.SESSIONS_MAX} sessions"
                 yield from self._state.quotas.refuse(reply_to, asker, bound)
                 return
             if sessions.full(self._state.now_ns) and not (yield from self._make_room()):

@@ -1,4 +1,4 @@
-"""Views at the shard's door: committed data without a lock, as of now or as of a stamp.
+"""Views and stamps at the shard's door: committed data without a lock, as of now or as of a stamp.
 
 A view over several shards is one cut if all of them answer as of one stamp T: every commit stamped
 up to T is shown, none after it.  The answer says from when to when its data were current; that
@@ -10,17 +10,30 @@ waits for those that are undecided and stamped up to T.
 A strict view as of T is about history: it is answered with the data as of T, or with what is
 forgotten of them, and never with the present.  Where an undecided commit still stands in the way
 after the wait, its interval ends before T, and it is to be asked again.
+
+A question about a stamp asks when everything up to it has become visible.  The cost of a message
+does not grow with the number of parked requests of either kind: the one that waits longest is found
+at once, and so is the one with the smallest stamp.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+import heapq
+from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeVar
 
 from enact_dist.core.protocol.checks import unknown_world
 from enact_dist.core.protocol.datum import Column, Slot
-from enact_dist.core.protocol.messages import EpochChanged, Forgotten, Refused, TakeView, Viewed
+from enact_dist.core.protocol.messages import (
+    AwaitStamp,
+    EpochChanged,
+    Forgotten,
+    Reached,
+    Refused,
+    TakeView,
+    Viewed,
+)
 from enact_dist.core.protocol.records import Reply
-from enact_dist.core.shard.parked import Parked
+from enact_dist.core.state.grants import WAIT_SLICE_NS_MAX
 from enact_dist.patterns import pattern_matches
 from enact_dist.terms import ACCESSES
 
@@ -37,6 +50,91 @@ VIEW_WAIT_NS: Final = 400_000_000
 """How long a view waits for undecided commits; then it is answered, and may be asked again."""
 WAITING_MAX: Final = 2048
 """Views that wait at one shard; further ones are answered as if they had waited enough."""
+OF_A_SESSION_MAX: Final = 64
+"""Questions of one kind that a session may have parked; the oldest one is answered for the next."""
+STALE_MAX: Final = 1024
+"""Entries of questions that were answered early may stay in a heap up to as many as are parked
+and these, then they are swept out."""
+
+T = TypeVar("T")
+
+
+class Waiting(NamedTuple, Generic[T]):
+    """One parked question: whose it is, and when its wait is over."""
+
+    question: T
+    session: str
+    end_ns: int
+
+
+class Order:
+    """Parked questions by a number, the smallest first; those that are gone are passed over."""
+
+    __slots__ = ("_heap", "_parked")
+
+    def __init__(self, parked: dict[int, Waiting[T]]) -> None:
+        self._parked = parked
+        self._heap: list[tuple[int, int]] = []
+
+    def add(self, number: int, reply_to: int) -> None:
+        """Put a parked question in its place."""
+        if len(self._heap) > 2 * len(self._parked) + STALE_MAX:
+            self._heap = [entry for entry in self._heap if entry[1] in self._parked]
+            heapq.heapify(self._heap)
+        heapq.heappush(self._heap, (number, reply_to))
+
+    def first(self) -> tuple[int, int] | None:
+        """Return the smallest number, and the question that has it; None if nothing is parked."""
+        heap = self._heap
+        while heap and heap[0][1] not in self._parked:
+            heapq.heappop(heap)
+        return heap[0] if heap else None
+
+
+class Parked(Generic[T]):
+    """All parked questions of one kind, by where their answers go."""
+
+    __slots__ = ("_by_end", "_of_session", "by_reply")
+
+    def __init__(self) -> None:
+        self.by_reply: dict[int, Waiting[T]] = {}
+        self._by_end = Order(self.by_reply)
+        self._of_session: dict[str, dict[int, None]] = {}
+
+    def __len__(self) -> int:
+        return len(self.by_reply)
+
+    def add(self, reply_to: int, question: T, *, session: str, end_ns: int) -> int | None:
+        """Park a request; return the oldest one of its session if that has too many."""
+        self.by_reply[reply_to] = Waiting(question, session, end_ns)
+        self._by_end.add(end_ns, reply_to)
+        of_session = self._of_session.setdefault(session, {})
+        of_session[reply_to] = None
+        return next(iter(of_session)) if len(of_session) > OF_A_SESSION_MAX else None
+
+    def take(self, reply_to: int) -> T:
+        """Let a question go that is answered now."""
+        question, session, _ = self.by_reply.pop(reply_to)
+        of_session = self._of_session[session]
+        del of_session[reply_to]
+        if not of_session:
+            del self._of_session[session]
+        return question
+
+    def ended(self, now_ns: int) -> Iterator[tuple[int, T]]:
+        """Remove and yield the requests whose wait is over."""
+        while (first := self._by_end.first()) is not None and first[0] <= now_ns:
+            yield first[1], self.take(first[1])
+
+    def all(self) -> Iterator[tuple[int, T]]:
+        """Remove and yield all requests, in order."""
+        for reply_to in list(self.by_reply):
+            yield reply_to, self.take(reply_to)
+
+    def next_end_ns(self) -> int | None:
+        """Return when the next wait is over."""
+        first = self._by_end.first()
+        return None if first is None else first[0]
 
 
 class ViewDesk:
@@ -184,6 +282,68 @@ class ViewDesk:
 
     def next_deadline_ns(self) -> int | None:
         """Return when a view has waited enough."""
+        return self._parked.next_end_ns()
+
+
+class StampDesk:
+    """Everything about waiting for commits that are not decided yet.
+
+    Attributes:
+        waits: The questions that wait for their stamp.
+    """
+
+    def __init__(self, state: ShardState, prepares: PrepareDesk) -> None:
+        self._state = state
+        self._prepares = prepares
+        self._parked = Parked[AwaitStamp]()
+        self.waits: Collection[int] = self._parked.by_reply
+        self._by_stamp = Order(self._parked.by_reply)
+
+    def on_await_stamp(self, message: AwaitStamp, reply_to: int) -> Iterator[Effect]:
+        """Answer at once, or park the question of a session until the stamp is reached."""
+        state = self._state
+        stamp_ns, shown_ns = state.stamp(), self._shown_ns()
+        reached = message.stamp_ns <= shown_ns
+        wait_ns = min(message.wait_ns, WAIT_SLICE_NS_MAX)
+        if reached or wait_ns <= 0 or not message.session or state.draining:
+            yield Reply(reply_to, Reached(reached, stamp_ns))
+            return
+        if message.epoch != state.epoch or state.sessions.known(message.session) is None:
+            yield Reply(reply_to, EpochChanged(state.epoch))
+            return
+        oldest = self._parked.add(
+            reply_to, message, session=message.session, end_ns=state.now_ns + wait_ns
+        )
+        self._by_stamp.add(message.stamp_ns, reply_to)
+        if oldest is not None:
+            self._parked.take(oldest)
+            yield Reply(oldest, Reached(False, stamp_ns))
+
+    def answer_reached(self) -> Iterator[Effect]:
+        """Answer those whose stamp is reached, and those whose wait is over."""
+        if not self.waits:
+            return
+        stamp_ns, shown_ns = self._state.stamp(), self._shown_ns()
+        while (first := self._by_stamp.first()) is not None and first[0] <= shown_ns:
+            self._parked.take(first[1])
+            yield Reply(first[1], Reached(True, stamp_ns))
+        for reply_to, _ in self._parked.ended(self._state.now_ns):
+            yield Reply(reply_to, Reached(False, stamp_ns))
+
+    def answer_all(self) -> Iterator[Effect]:
+        """Answer everybody: this shard ends."""
+        yield from self.answer_reached()
+        for reply_to, _ in self._parked.all():
+            yield Reply(reply_to, Reached(False, self._state.stamp()))
+
+    def _shown_ns(self) -> int:
+        """Return the stamp up to which every commit is visible."""
+        undecided = [stamp_ns for stamp_ns, _ in self._state.commits.undecided()]
+        undecided += [record.stamp_ns for record in self._prepares.undecided()]
+        return min([self._state.stamp(), *(stamp_ns - 1 for stamp_ns in undecided)])
+
+    def next_deadline_ns(self) -> int | None:
+        """Return when the next wait is over."""
         return self._parked.next_end_ns()
 
 

@@ -1,10 +1,10 @@
-"""Whose session a message speaks for: the identity under which it came decides.
+"""Whose session a message speaks for, and how much of a shard one identity may take.
 
-An identity is a short text.  The transport says it with each message (`Shard.handle`), and this
-module is all that asks for it, so that what vouches for an identity may change without the rules.
-Today a client says its own: actor, host and process, in the key of its requests and when it opens
-a socket.  That stops a fault or a stray tool; against malice it needs certificates or users, whose
-name stands in the same place then.
+The identity under which a message came decides.  An identity is a short text.  The transport says
+it with each message (`Shard.handle`), and this module is all that asks for it, so that what vouches
+for an identity may change without the rules.  Today a client says its own: actor, host and process,
+in the key of its requests and when it opens a socket.  That stops a fault or a stray tool; against
+malice it needs certificates or users, whose name stands in the same place then.
 
 Rules to keep
 
@@ -14,6 +14,13 @@ Rules to keep
 - `Finish`, `Resolve` and a `ListPlaces` that names a shard come from that shard, under
   `shard_identity`.
 - The identity "" is this process itself: an embedded shard, or a simulated one.
+
+Shares are bounded so that one client never leaves the others nothing.  An identity is one process
+of a client as yet, so two hundred processes of one name on one host have two hundred shares, and a
+fault in one of them uses up its own.  The bounds are far from what any program of a cell needs.
+Against one that gives itself a new identity with each message they do not help; where that has
+filled the table of sessions, those that never showed a further sign of life make room
+(`SessionTable.unproven`).
 """
 
 from __future__ import annotations
@@ -38,15 +45,24 @@ from enact_dist.core.protocol.messages import (
     Request,
     Resolve,
 )
+from enact_dist.core.protocol.records import Reply, Story
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
-    from enact_dist.core.protocol.records import Event
+    from enact_dist.core.protocol.records import Effect, Event
     from enact_dist.core.state.sessions import SessionTable
 
 PERMISSION: Final = "permission"
 """The code of a refusal because of the sender."""
+SESSIONS_MAX: Final = 256
+"""Sessions of one identity: a process needs one for each cell that it has open."""
+WAITERS_MAX: Final = 2_048
+"""Locks of one identity, granted or waiting: twice as many as a session has threads."""
+ITEMS_WAITING_MAX: Final = 65_536
+"""Requests in the locks of one identity that wait."""
+TOLD_MAX: Final = 1_000
+"""So many identities the log names, each once, until the shard starts again."""
 _SHARD: Final = "shard."
 
 
@@ -122,3 +138,22 @@ def _not_its_shard(message: Finish | Resolve | ListPlaces, identity: str) -> Ref
         return None
     said = f"{type(message).__name__} in the name of shard {named}"
     return Refused(PERMISSION, f"{identity} asked a {said}; only that shard itself may")
+
+
+class Quotas:
+    """Refuses requests beyond a share, counts them, and logs each identity once."""
+
+    __slots__ = ("_count", "_told")
+
+    def __init__(self, count: Callable[[str], None]) -> None:
+        self._count = count
+        self._told: set[str] = set()
+
+    def refuse(self, reply_to: int, identity: str, bound: str) -> Iterator[Effect]:
+        """Refuse a request because its identity has all of a bound, such as "256 sessions"."""
+        self._count("quota_refused")
+        text = f"{identity} has {bound} at this shard, which is all that one process may have"
+        if identity not in self._told and len(self._told) < TOLD_MAX:
+            self._told.add(identity)
+            yield Story("quota.refused", f"{text}; further refusals are only counted")
+        yield Reply(reply_to, Refused("overload", f"{text}; end some, or wait for their end"))

@@ -75,8 +75,7 @@ from enact_dist.core.shard.on_history import HistoryDesk, LineageDesk
 from enact_dist.core.shard.on_lock import LockDesk
 from enact_dist.core.shard.on_prepare import PrepareDesk
 from enact_dist.core.shard.on_session import SessionDesk
-from enact_dist.core.shard.on_stamp import StampDesk
-from enact_dist.core.shard.on_view import ViewDesk
+from enact_dist.core.shard.on_view import StampDesk, ViewDesk
 from enact_dist.core.shard.on_world import WorldDesk
 from enact_dist.core.shard.places import PlaceDesk
 from enact_dist.core.shard.state import ShardSettings, ShardState
@@ -211,7 +210,7 @@ class Shard:
                 state.count("epoch_refusals")
             else:
                 state.count("requests_refused")
-        if not state.stored:
+        if self._stamps.waits and not state.stored:
             effects += self._stamps.answer_reached()
         if self._views.waits or self._worlds.waits:
             decided = not state.stored or type(message) in _DECIDE
@@ -289,7 +288,8 @@ class Shard:
 
     def _on_persisted(self, message: Persisted, _: int) -> Iterator[Effect]:
         yield from self.state.persisted(message.ticket)
-        yield from self._stamps.answer_reached()
+        if self._stamps.waits:
+            yield from self._stamps.answer_reached()
 
     def _on_called(self, message: Called, reply_to: int) -> Iterator[Effect]:
         if isinstance(message.answer, Places):

@@ -19,21 +19,20 @@ from enact_dist.core.protocol.messages import (
     WorldEntry,
 )
 from enact_dist.core.protocol.records import Persist
-from enact_dist.core.shard.pins import Pins
-from enact_dist.core.shard.quotas import Quotas
+from enact_dist.core.shard.owners import Quotas
 from enact_dist.core.state.audit import Audit
 from enact_dist.core.state.catalogue import Catalogue
 from enact_dist.core.state.clock import Stamps, newest_stamp
 from enact_dist.core.state.commits import Commits
 from enact_dist.core.state.decisions import Decisions
 from enact_dist.core.state.grants import Tenure, Tenures
-from enact_dist.core.state.sessions import Session, SessionTable
+from enact_dist.core.state.sessions import LANES_MAX, Session, SessionTable
 from enact_dist.core.state.slots import SlotMap
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Mapping
 
-    from enact_dist.core.protocol.datum import LockId
+    from enact_dist.core.protocol.datum import Datum, LockId, Slot
     from enact_dist.core.protocol.messages import (
         Answer,
         Break,
@@ -44,6 +43,8 @@ if TYPE_CHECKING:
     )
     from enact_dist.core.protocol.records import Effect, Record, Recovered, Then
     from enact_dist.terms import Durability
+
+    Pinned = dict[tuple[Slot, int], Datum]
 
 FETCH_BYTES_MAX: Final = 4 << 20
 """Largest part of a datum in one answer, so that small answers never wait long behind it."""
@@ -77,6 +78,65 @@ class ShardSettings:
     shared: str = ""
     shared_nonce: bytes = b""
     start: int = 0
+
+
+class Pins:
+    """What views without a lock keep fetchable: the large data that answers have only named.
+
+    A client names a view by a lock of one of its lanes, and has at most `LANES_MAX` of these.  So a
+    session keeps no more than that many views here: an older view of the same lane goes first, then
+    the oldest of all.  What a client asks about costs by its own pins, never by those of others.
+
+    Attributes:
+        by_session: The data: by session, lock, then slot and version.
+    """
+
+    __slots__ = ("by_session",)
+
+    def __init__(self) -> None:
+        self.by_session: dict[str, dict[LockId, Pinned]] = {}
+
+    def __bool__(self) -> bool:
+        return bool(self.by_session)
+
+    def __iter__(self) -> Iterator[LockId]:
+        """Yield every lock that pins something."""
+        for pinned in self.by_session.values():
+            yield from pinned
+
+    def get(self, lock: LockId) -> Mapping[tuple[Slot, int], Datum]:
+        """Return what a lock pins."""
+        return self.by_session.get(lock.session, {}).get(lock, {})
+
+    def add(self, lock: LockId, data: Pinned) -> bool:
+        """Pin more for a lock; return whether a view that may still be wanted had to go."""
+        mine = self.by_session.setdefault(lock.session, {})
+        displaced = False
+        if lock not in mine and len(mine) >= LANES_MAX:
+            self.drop_older(lock.session, {lock.lane: lock.seq})
+            mine = self.by_session.setdefault(lock.session, {})
+            displaced = len(mine) >= LANES_MAX
+            if displaced:
+                del mine[next(iter(mine))]
+        # Added to: the client may have taken an answer to an earlier view of this lock.
+        mine.setdefault(lock, {}).update(data)
+        return displaced
+
+    def drop(self, lock: LockId) -> None:
+        """Forget what a lock pins."""
+        mine = self.by_session.get(lock.session)
+        if mine is not None and mine.pop(lock, None) is not None and not mine:
+            del self.by_session[lock.session]
+
+    def drop_older(self, session: str, lowest: Mapping[int, int]) -> None:
+        """Forget what the locks of a session pin that come before the lowest seq of their lane."""
+        mine = self.by_session.get(session, {})
+        for lock in [lock for lock in mine if lock.seq < lowest.get(lock.lane, 0)]:
+            self.drop(lock)
+
+    def drop_session(self, session: str) -> None:
+        """Forget everything that a session's views keep."""
+        self.by_session.pop(session, None)
 
 
 class ShardState:

@@ -27,8 +27,7 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.core.protocol.datum import Column, Datum, LockId, Slot, Token
 from enact_dist.core.protocol.messages import Acquire, Granted, Holder, Item, Waiting
 from enact_dist.core.protocol.records import Effect, Reply, Story
-from enact_dist.core.state.clock import Latencies
-from enact_dist.core.state.due_times import DueTimes
+from enact_dist.core.state.clock import DueTimes, Latencies
 from enact_dist.core.state.lock_table import Claim, LockTable, Mode, Resource, join
 from enact_dist.core.state.slots import SlotMap
 from enact_dist.patterns import pattern_matches

@@ -17,7 +17,7 @@ from itertools import islice
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.parts import CAUSE_COMMIT, Cause
-from enact_dist.core.state.due_times import DueTimes
+from enact_dist.core.state.clock import DueTimes
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator

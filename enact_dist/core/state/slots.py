@@ -9,13 +9,15 @@ comparable within one epoch of the shard.
 from __future__ import annotations
 
 from dataclasses import replace
+from heapq import nlargest
+from itertools import islice
+from operator import itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from enact_dist.core.protocol.datum import Column, Datum, Slot
 from enact_dist.core.protocol.messages import Forgotten, SlotState, SlotVersion
 from enact_dist.core.protocol.records import LOST, NOTHING, Content, content_of
 from enact_dist.core.state.history import History
-from enact_dist.core.state.large_slots import LARGE_BYTES, LargeSlots
 from enact_dist.core.state.retention import AspectBases, Bases, PayloadNames
 from enact_dist.patterns import pattern_matches
 from enact_dist.terms import ACCESSES, NullReason
@@ -36,6 +38,10 @@ INLINE_BYTES_MAX: Final = 64 * 1024
 """Data up to this size travel with the grant; larger ones are fetched when they are read."""
 ANSWER_BYTES_MAX: Final = 8 << 20
 """So many bytes of small data travel with one grant; a pattern's further ones count as large."""
+LARGE_BYTES: Final = 64 << 10
+"""Smaller data are not counted: they never lie in shared memory."""
+LOOKED_MAX: Final = 1000
+"""Slots of a group that one question looks at."""
 
 
 _OUTSIDE: Final = Content(0, 0, None, NullReason.OUTSIDE_RETENTION)
@@ -53,6 +59,39 @@ class Shown(NamedTuple):
     states: list[SlotState]
     pins: dict[tuple[Slot, int], Datum]
     from_ns: int
+
+
+class LargeSlots:
+    """The slots whose newest data are large: the largest are found at once, of however many.
+
+    Slots stand in groups by the power of two of their size.  A question looks at the topmost
+    groups, and there at some of each: what it names is as large as the largest ones, or half of it
+    at least.
+    """
+
+    __slots__ = ("_groups",)
+
+    def __init__(self) -> None:
+        self._groups: dict[int, dict[Slot, int]] = {}
+
+    def change(self, slot: Slot, *, before: int, after: int) -> None:
+        """Note that the datum of a slot has so many bytes now (0: it is null, or gone)."""
+        if before >= LARGE_BYTES:
+            group = self._groups[before.bit_length()]
+            del group[slot]
+            if not group:
+                del self._groups[before.bit_length()]
+        if after >= LARGE_BYTES:
+            self._groups.setdefault(after.bit_length(), {})[slot] = after
+
+    def largest(self, count: int) -> list[tuple[str, int]]:
+        """Return slots with the largest data, with their bytes; fewer where few are large."""
+        found: list[tuple[Slot, int]] = []
+        for exponent in sorted(self._groups, reverse=True):
+            found += islice(self._groups[exponent].items(), LOOKED_MAX)
+            if len(found) >= count:
+                break
+        return [(str(slot), size) for slot, size in nlargest(count, found, key=itemgetter(1))]
 
 
 class SlotMap:
