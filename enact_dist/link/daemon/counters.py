@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 BODIES: Final = (
     f"arrays, long lists, texts and bytes over {INLINE_BYTES_MAX} B; other data count as 0"
 )
-"""The part of a datum that counters of bytes count: its body (see `enact_dist.wire`)."""
+"""The part of a datum that counters of bytes count: its body (see `docs/protocol.md`)."""
 
 
 class Counter(NamedTuple):
