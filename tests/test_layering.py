@@ -67,9 +67,8 @@ ACTORS_MAY_IMPORT = {
 }  # fmt: skip
 ACTORS_STILL_IMPORT = {
     "actor.binding", "actor.check", "actor.graph", "actor.outcome", "actor.running.load",
-    "actor.running.process", "actor.running.commands", "cli.text.output", "cli.world.lineage",
-    "compare.diff", "config.read", "core.protocol.datum", "link.signals", "wire.payload",
-    "world.lineage",
+    "actor.running.process", "actor.running.commands", "compare.diff", "config.read",
+    "core.protocol.datum", "link.signals", "wire.payload", "world.lineage", "world.trees",
 }  # fmt: skip
 """Modules inside the package that applications use beside its public parts."""
 TOP_LEVEL = {"LICENSE", "README.md", "actors", "deploy", "enact_dist", "pyproject.toml", "tests"}
