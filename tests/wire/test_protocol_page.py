@@ -193,7 +193,7 @@ def test_examples_of_data_are_what_is_sent():
 
 def test_frames_of_a_stream_have_the_kinds_of_the_page():
     """And the prefix is as long as it says."""
-    compare("Frames of a stream", [(int(kind), kind.name) for kind in stream.Kind], 2)
+    compare("Frames of a stream", [(int(kind), kind.name) for kind in stream.FrameKind], 2)
     prefix = stream.prefixed(b"", 0)
     assert f"{stream.PREFIX_BYTES} bytes" in TEXT
     assert f"`{prefix[:3].hex(' ')}`" in TEXT
