@@ -139,7 +139,7 @@ OF_A_SHARD: Final[dict[str, Figure]] = {
     "stalls": Figure("times that this host stood still; leases were extended by that time", _BUSY),
     "disk_stalls": Figure(
         "disk writes that took more than a second",
-        "move the shard's folder to another disk; its log says when",
+        "move the shard's folder to another disk; the shard's log gives the times",
     ),
     "overloads": Figure(
         "requests refused because too many wait", "find their clients: enact lock ls"
@@ -253,7 +253,7 @@ GAUGES_OF_A_SHARD: Final[dict[str, Figure]] = {
         "1 while the shard grants locks, 0 right after its start and while it shuts down"
     ),
     "epoch": _gauge(
-        "number of this start; it changes with each restart", "the shard's log says why"
+        "number of this start; it changes with each restart", "the shard's log gives the reason"
     ),
     "uptime_seconds": _gauge("time since this start"),
     "sessions": _gauge("clients that are connected, or were until a moment ago"),
@@ -280,7 +280,7 @@ LATENCIES_OF_A_SHARD: Final[dict[str, Figure]] = {
 }
 
 
-def told(counters: Mapping[str, int]) -> Iterator[tuple[str, int, str, str]]:
+def described(counters: Mapping[str, int]) -> Iterator[tuple[str, int, str, str]]:
     """Yield name, value, meaning and remedy of each counter above 0, in the order of the table."""
     order = {name: number for number, name in enumerate(OF_A_SHARD)}
     for name in sorted(counters, key=lambda name: (order.get(name, len(order)), name)):
