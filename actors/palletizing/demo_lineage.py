@@ -20,8 +20,7 @@ from actors.palletizing.vocabulary import (
     view_entity,
 )
 from enact_dist import Entity, View
-from enact_dist.cli.text.output import print_tree
-from enact_dist.cli.world.lineage import drawn
+from enact_dist.world.trees import drawn, print_tree
 
 if TYPE_CHECKING:
     from collections.abc import Collection

@@ -11,8 +11,7 @@ from actors.workcell.demo_conduct import DEPTH, masks_of
 from actors.workcell.evaluation import GOALS, missed
 from actors.workcell.trace import ONLINE
 from enact_dist import View
-from enact_dist.cli.text.output import print_tree
-from enact_dist.cli.world.lineage import drawn
+from enact_dist.world.trees import drawn, print_tree
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -65,7 +65,7 @@ _changeable: dict[Any, bool] = {}
 codecs.changed.append(_changeable.clear)
 
 
-class Shown(NamedTuple):
+class ReceivedValue(NamedTuple):
     """A value that a block received, and its datum."""
 
     value: Any
@@ -106,8 +106,8 @@ def _parts(shape: Shape) -> Iterator[Shape]:
 
 
 def refuse_changed(
-    shown: Mapping[Slot, Shown],
-    assigned: Mapping[Slot, Shown],
+    shown: Mapping[Slot, ReceivedValue],
+    assigned: Mapping[Slot, ReceivedValue],
     written: Mapping[Slot, Datum | None],
     requests: Collection[LockRequest[Any]],
 ) -> None:
@@ -153,7 +153,7 @@ def _allowing(each: Iterable[LockRequest[Any]], slot: Slot) -> LockRequest[Any] 
     return None
 
 
-def _was_changed(shown: Shown) -> bool:
+def _was_changed(shown: ReceivedValue) -> bool:
     """Whether a value is another one than its datum's."""
     now = _encoded(shown.value, shown.datum_type)
     datum = shown.datum
@@ -225,7 +225,7 @@ class Readings:
         for reading in readings:
             self._readings[reading.state.slot] = reading
         self.looked_at: dict[Slot, Any] = {}
-        self.changeable: dict[Slot, Shown] = {}
+        self.changeable: dict[Slot, ReceivedValue] = {}
         self._kept: dict[Slot, Datum] = {}
         self._fetched_alone = 0
         self.asked: Iterable[LockRequest[Any]] = ()
@@ -328,7 +328,7 @@ class Readings:
             self.looked_at[slot] = value
             self.decoded += 1
             if changeable(datum_type):
-                self.changeable[slot] = Shown(value, datum, datum_type)
+                self.changeable[slot] = ReceivedValue(value, datum, datum_type)
         return value
 
     def null_error(self, slot: Slot) -> NullDatumError:

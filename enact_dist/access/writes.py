@@ -25,7 +25,7 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias, cast
 
-from enact_dist.access.reads import Shown, changeable, misfit, null_error
+from enact_dist.access.reads import ReceivedValue, changeable, misfit, null_error
 from enact_dist.core.protocol.datum import Datum, Slot
 from enact_dist.core.protocol.messages import WriteItem
 from enact_dist.core.protocol.parts import READS_MAX
@@ -132,7 +132,7 @@ class Writing:
         self._bytes = 0
         self.data: dict[Slot, Datum | None] = {}
         self.edits = 0
-        self.looked_at: dict[Slot, Shown] = {}
+        self.looked_at: dict[Slot, ReceivedValue] = {}
 
     def by_shard(
         self, shard_of: Callable[[Slot], str], only: str = ""
@@ -175,7 +175,7 @@ class Writing:
             return shown.value
         value = decode_datum(datum, datum_type)
         if changeable(datum_type):
-            self.looked_at[slot] = Shown(value, datum, datum_type)
+            self.looked_at[slot] = ReceivedValue(value, datum, datum_type)
         return value
 
     def delete(self, slot: Slot) -> None:
@@ -261,7 +261,7 @@ class Writing:
         datum = encoded.over(shown, draft.file if draft is not None else "")
         self._note(slot, _Written(datum, draft, arrays), size)
         if changeable(datum_type):
-            self.looked_at[slot] = Shown(value, datum, datum_type)
+            self.looked_at[slot] = ReceivedValue(value, datum, datum_type)
         return value
 
     def _memory(self, shard: str, encoded: Encoded) -> tuple[Draft | None, memoryview, memoryview]:

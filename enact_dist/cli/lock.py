@@ -19,12 +19,12 @@ from enact_dist.cli.arguments import (
     whole,
 )
 from enact_dist.cli.target import open_cell
-from enact_dist.cli.text.output import shown_s
 from enact_dist.cli.verbs import DONE, LOOKS, UNREACHABLE, Output, Verb, option
 from enact_dist.errors import ConfigError, LeaseLostError, MisuseError, ShardUnreachableError
 from enact_dist.link.signals import StopSignals
 from enact_dist.terms import Access, Entities, Entity, checked_name
 from enact_dist.wire.texts import shown
+from enact_dist.world.trees import shown_s
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator

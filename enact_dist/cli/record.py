@@ -16,10 +16,11 @@ from enact_dist.cli.arguments import (
     seconds,
 )
 from enact_dist.cli.target import cell_target, is_endpoint, open_cell
-from enact_dist.cli.text.output import ProgressLine, print_json, shown_bytes, shown_s
+from enact_dist.cli.text.output import ProgressLine, print_json, shown_bytes
 from enact_dist.cli.text.times import MOMENT_HELP, moment
 from enact_dist.cli.verbs import DONE, FAILED, NOUNS, Verb, flag, many, option
 from enact_dist.link.signals import StopSignals
+from enact_dist.world.trees import shown_s
 
 if TYPE_CHECKING:
     import argparse

@@ -285,7 +285,7 @@ def shared_data(shard: ShardInfo) -> Iterator[Finding]:
     if not most:
         if "payload_bytes_max" in counters:
             found = "none: its large data travel, on its own host too"
-            remedy = "its log says why, unless shared_bytes_max = 0 asks for it"
+            remedy = "the shard's log gives the reason, unless shared_bytes_max = 0 asks for it"
             yield warn(subject, found, remedy)
         return
     text = f"{counters.get('payload_files', 0)} files, {used} of {most} bytes"

@@ -18,7 +18,7 @@ key              type  value
 ``host``         str   … on which host
 ``pid``          int   … in which process
 ``null``         str   why it is null, as `NullReason` names it; "" for a datum
-``encoding``     bin   the datum as `enact_dist.wire` defines it: its encoding
+``encoding``     bin   the datum as `docs/protocol.md` defines it: its encoding
 ``body``         bin   … and its body
 ===============  ====  ===========================================================================
 

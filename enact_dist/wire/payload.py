@@ -1,7 +1,8 @@
 """Data to bytes and back: a tree of plain values in the encoding, their buffers in the body.
 
-`enact_dist.wire` describes the format.  Laws: what is encoded decodes equal, of the same types;
-arrays come back as read-only views of the body; a datum is a copy of its value, made once.
+`enact_dist/docs/protocol.md` describes the format.  Laws: what is encoded decodes equal, of the
+same types; arrays come back as read-only views of the body; a datum is a copy of its value, made
+once.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Values to the nodes of a tree, and their buffers to a body; see `enact_dist.wire` for the format.
+"""Values to the nodes of a tree, and their buffers to a body, as `docs/protocol.md` describes them.
 
 Rules to keep: what is written reads back equal and of the same types, or it is refused here with
 the path of the part; nothing is copied before the body is joined; the writer never calls user code

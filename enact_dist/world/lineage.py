@@ -42,6 +42,12 @@ if TYPE_CHECKING:
 FORGOTTEN: Final = "forgotten"
 UNKNOWN: Final = "unknown"
 NULL: Final = "null"
+_KIND: Final = {
+    FORGOTTEN: "forgotten: it has left its retention",
+    UNKNOWN: "its cause is not known",
+    NULL: "null",
+    "fork": "forked",
+}
 
 DEPTH_MAX: Final = 200
 """Most steps of one tree: a recursive walk stays within Python's recursion limit."""
@@ -109,6 +115,13 @@ class Made:
     def slot(self) -> Slot:
         """What it is a version of."""
         return Slot(self.world, self.entity.name, self.aspect)
+
+    @property
+    def made_by(self) -> str:
+        """Who made it, or why its cause is not known, in words."""
+        said = _KIND.get(self.kind, "")
+        by = f"{self.actor or '(unnamed)'}@{self.host}" if self.host else ""
+        return f"{said}, {by}" if said and by else said or by
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} of {self.slot} v{self.version}>"

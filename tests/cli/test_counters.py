@@ -6,7 +6,7 @@ from pathlib import Path
 import enact_dist
 from enact_dist.core.protocol.messages import ListSessions, PlacementMap, ShardEntry
 from enact_dist.core.shard.state import ShardSettings
-from enact_dist.link.daemon.counters import OF_A_CONNECTION, OF_A_SHARD, told
+from enact_dist.link.daemon.counters import OF_A_CONNECTION, OF_A_SHARD, described
 from enact_dist.link.host import open_host
 from enact_dist.link.memory.payload_desk import PayloadDesk
 
@@ -80,7 +80,7 @@ def test_counters_of_a_running_shard_are_in_the_table():
 
 def test_table_is_shown_in_its_order_without_what_is_zero():
     """A counter of a newer release is shown last, by its name."""
-    rows = list(told({"newer": 2, "disk_stalls": 1, "commits": 7, "fenced": 0}))
+    rows = list(described({"newer": 2, "disk_stalls": 1, "commits": 7, "fenced": 0}))
 
     assert [row[:2] for row in rows] == [("commits", 7), ("disk_stalls", 1), ("newer", 2)]
     assert "another disk" in rows[1][3]

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from enact_dist.cli.text import output
+from enact_dist.world import trees
 
 
 @pytest.mark.parametrize(
@@ -21,7 +22,7 @@ from enact_dist.cli.text import output
 )
 def test_durations_have_the_unit_that_fits(value_s, text):
     """People read two figures, not nine."""
-    assert output.shown_s(value_s) == text
+    assert trees.shown_s(value_s) == text
 
 
 @pytest.mark.parametrize(
@@ -42,13 +43,12 @@ def test_plain_table_is_aligned(capsys):
 
 def test_table_and_tree_are_drawn_on_a_terminal(capsys, monkeypatch):
     """On a terminal the same content is drawn; brackets in data are no markup."""
-    from enact_dist.cli.text.output import Branch
+    for module in (output, trees):
+        monkeypatch.setattr(module, "on_terminal", lambda _=None: True)
+    root = trees.Branch("online")
+    root.at(["tray", "1"]).children[" count"] = trees.Branch("count [bold]v1[/]")
 
-    monkeypatch.setattr(output, "on_terminal", lambda _=None: True)
-    root = Branch("online")
-    root.at(["tray", "1"]).children[" count"] = Branch("count [bold]v1[/]")
-
-    output.print_tree(root)
+    trees.print_tree(root)
     output.print_table(("name",), [("[red]a[/]",)], empty="none")
 
     out = capsys.readouterr().out
@@ -76,7 +76,7 @@ HOSTILE = "a\nforged row\x1b[2J\u202e[bold]x[/]"
 def test_table_and_tree_show_control_characters_escaped(capsys):
     """A row stays one row, the screen stays as it is, markup is text."""
     output.print_table(("actor", "host"), [(HOSTILE, "h")], empty="")
-    output.print_tree(SimpleNamespace(label=HOSTILE, children={}))
+    trees.print_tree(SimpleNamespace(label=HOSTILE, children={}))
     said = capsys.readouterr().out
 
     assert len(said.splitlines()) == 3

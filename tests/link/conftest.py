@@ -30,7 +30,7 @@ from enact_dist.core.protocol.messages import (
 from enact_dist.core.shard.state import ShardSettings
 from enact_dist.link.log import in_words
 from enact_dist.link.memory.shared_folder import SharedFolder
-from enact_dist.link.socket.frames import Kind, Stream, greeting_of, send_frame
+from enact_dist.link.socket.frames import FrameKind, Stream, greeting_of, send_frame
 from enact_dist.terms import Access
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -248,8 +248,8 @@ def raw(daemon, endpoint):
         near.connect(folder.address("socket"))
         opened.append(near)
         if greet:
-            send_frame(near, greeting_of(session, "tester"), kind=Kind.OPEN)
-            assert Stream(near).receive()[0] == Kind.OPENED
+            send_frame(near, greeting_of(session, "tester"), kind=FrameKind.OPEN)
+            assert Stream(near).receive()[0] == FrameKind.OPENED
         return near
 
     connected.shard = shard

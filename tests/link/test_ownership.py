@@ -14,7 +14,7 @@ from enact_dist.errors import PermissionDeniedError, ProtocolError
 from enact_dist.link.memory import payload_desk
 from enact_dist.link.refusals import error_of
 from enact_dist.link.socket import service as socket_service
-from enact_dist.link.socket.frames import Kind
+from enact_dist.link.socket.frames import FrameKind
 from enact_dist.link.zenoh.config import MESSAGE_BYTES_MAX, close_session, open_session
 from enact_dist.link.zenoh.queries import wait_connected
 from enact_dist.wire.frames import decode_frame, encode_frame
@@ -161,10 +161,10 @@ def test_stranger_uses_up_no_data_that_wait_for_their_commit(
 
 GREETS_AND_ENDS = """
 import socket, sys
-from enact_dist.link.socket.frames import Kind, Stream, greeting_of, send_frame
+from enact_dist.link.socket.frames import FrameKind, Stream, greeting_of, send_frame
 near = socket.socket(socket.AF_UNIX)
 near.connect(sys.argv[1])
-send_frame(near, greeting_of(sys.argv[2], "eve@h:1"), kind=Kind.OPEN)
+send_frame(near, greeting_of(sys.argv[2], "eve@h:1"), kind=FrameKind.OPEN)
 kind, text, _ = Stream(near).receive()
 print(int(kind), text.decode(), flush=True)
 """
@@ -183,7 +183,7 @@ def test_process_that_greets_for_a_session_of_zenoh_does_not_end_it_with_its_own
     eve = program(GREETS_AND_ENDS, shard._shared.path / "socket", victim.session)
     said, _ = eve.communicate(timeout=30)
     kind, _, text = said.strip().partition(" ")
-    assert int(kind) == Kind.REFUSED
+    assert int(kind) == FrameKind.REFUSED
     assert "eve@h:1" in text
     assert "may not speak for it" in text
     assert isinstance(victim.commit(granted, "cup", b"1"), m.Committed)
@@ -193,12 +193,12 @@ RELEASES_ANOTHERS = """
 import socket, sys
 from enact_dist.core.protocol.datum import LockId
 from enact_dist.core.protocol.messages import Release
-from enact_dist.link.socket.frames import Kind, Stream, greeting_of, send_frame
+from enact_dist.link.socket.frames import FrameKind, Stream, greeting_of, send_frame
 from enact_dist.wire.frames import decode_frame, encode_frame
 near = socket.socket(socket.AF_UNIX)
 near.connect(sys.argv[1])
 stream = Stream(near)
-send_frame(near, greeting_of("e" * 32, sys.argv[3]), kind=Kind.OPEN)
+send_frame(near, greeting_of("e" * 32, sys.argv[3]), kind=FrameKind.OPEN)
 stream.receive()
 send_frame(near, encode_frame(Release(LockId(sys.argv[2], 0, 1)))[0])
 _, header, payload = stream.receive()

@@ -12,7 +12,7 @@ from socket_parts import ask, counters
 
 from enact_dist.core.protocol.datum import LockId
 from enact_dist.core.protocol.messages import Acquire, Hello, Item, ListLocks, Locks
-from enact_dist.link.socket.frames import Kind, Stream, greeting_of, prefixed, send_frame
+from enact_dist.link.socket.frames import FrameKind, Stream, greeting_of, prefixed, send_frame
 from enact_dist.terms import Access
 from enact_dist.wire.frames import encode_frame
 
@@ -45,7 +45,7 @@ class Visitor:
             return
         known = self._draw.random() < 0.9
         greeting = greeting_of(self._name, "crowd") if known else os.urandom(9)
-        send_frame(near, greeting, kind=Kind.OPEN)
+        send_frame(near, greeting, kind=FrameKind.OPEN)
         if self._draw.random() < 0.2:
             return  # before it is answered
         stream = Stream(near)
@@ -78,7 +78,7 @@ class Visitor:
         near.sendall(prefixed(header, 0)[: self._draw.randrange(1, len(header))])
 
     def _watch(self, near):
-        send_frame(near, b"", kind=Kind.WATCH)
+        send_frame(near, b"", kind=FrameKind.WATCH)
 
 
 @pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")

@@ -13,7 +13,7 @@ from enact_dist.link.socket.frames import (
     BUFFER_BYTES,
     PREFIX_BYTES,
     STREAM_VERSION,
-    Kind,
+    FrameKind,
     Stream,
     prefixed,
     rounded_s,
@@ -56,7 +56,7 @@ def test_frame_arrives_as_it_was_sent(ends, header, body):
     kind, found, found_payload = Stream(far).receive()
     sender.join()
 
-    assert (kind, found, bytes(found_payload)) == (Kind.MESSAGE, header, payload)
+    assert (kind, found, bytes(found_payload)) == (FrameKind.MESSAGE, header, payload)
 
 
 @pytest.mark.parametrize(("header", "body"), FRAMES)
@@ -76,8 +76,8 @@ def test_frame_is_taken_when_all_of_it_is_here(ends, header, body):
                 found.append(one)
 
     assert [(kind, head, bytes(body)) for kind, head, body in found] == [
-        (Kind.MESSAGE, header, payload),
-        (Kind.MESSAGE, b"next", b""),
+        (FrameKind.MESSAGE, header, payload),
+        (FrameKind.MESSAGE, b"next", b""),
     ]
     assert not stream.begun
     near.close()
@@ -208,7 +208,7 @@ def test_payload_is_put_where_it_will_stay_if_it_fits(ends, room, placed):
 def test_stream_of_another_release_is_refused_with_both_versions(ends, other):
     """The reader names the version that came, its own, and what to do."""
     near, far = ends
-    near.sendall(struct.pack("<2sBBIQ", b"ED", other, Kind.MESSAGE, 0, 0))
+    near.sendall(struct.pack("<2sBBIQ", b"ED", other, FrameKind.MESSAGE, 0, 0))
 
     said = (
         f"a stream of version {other} came; this side speaks {STREAM_VERSION}; run the same release"

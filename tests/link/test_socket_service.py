@@ -16,17 +16,17 @@ from enact_dist.core.protocol.messages import (
 )
 from enact_dist.link.socket import connection as socket_connection
 from enact_dist.link.socket import service as socket_service
-from enact_dist.link.socket.frames import Kind, Stream, greeting_of, send_frame
+from enact_dist.link.socket.frames import FrameKind, Stream, greeting_of, send_frame
 from enact_dist.wire.frames import decode_frame, encode_frame
 
 """How long an answer that nothing delays may take on a busy machine."""
 
 OPENS = """
 import socket, sys
-from enact_dist.link.socket.frames import Kind, Stream, greeting_of, send_frame
+from enact_dist.link.socket.frames import FrameKind, Stream, greeting_of, send_frame
 near = socket.socket(socket.AF_UNIX)
 near.connect(sys.argv[1])
-send_frame(near, greeting_of(sys.argv[2], "tester"), kind=Kind.OPEN)
+send_frame(near, greeting_of(sys.argv[2], "tester"), kind=FrameKind.OPEN)
 kind, text, _ = Stream(near).receive()
 print(int(kind), text.decode(), sep="\\n", flush=True)
 sys.stdin.read()
@@ -42,7 +42,7 @@ def test_connection_without_a_greeting_is_refused_and_the_others_served(raw):
 
     kind, text, _ = Stream(stranger).receive()
 
-    assert kind == Kind.REFUSED
+    assert kind == FrameKind.REFUSED
     assert b"starts no frame" in text
     assert counters(raw.shard)["connections_refused"] == 1
     assert isinstance(ask(raw(), ListLocks()), Locks)
@@ -103,11 +103,11 @@ def test_session_with_too_many_connections_is_refused_by_name(raw, monkeypatch):
     monkeypatch.setattr(socket_service, "SESSION_CONNECTIONS_MAX", 3)
     kept = [raw("greedy") for _ in range(3)]
     one_more = raw("greedy", greet=False)
-    send_frame(one_more, greeting_of("greedy", "tester"), kind=Kind.OPEN)
+    send_frame(one_more, greeting_of("greedy", "tester"), kind=FrameKind.OPEN)
 
     kind, text, _ = Stream(one_more).receive()
 
-    assert (kind, b"3 connections" in text) == (Kind.REFUSED, True)
+    assert (kind, b"3 connections" in text) == (FrameKind.REFUSED, True)
     assert isinstance(ask(raw("modest"), ListLocks()), Locks)
     assert isinstance(ask(kept[0], ListLocks()), Locks)
 
@@ -120,14 +120,14 @@ def test_process_that_opens_more_than_its_share_leaves_the_rest_to_others(
         monkeypatch.setattr(socket_service, name, most)
     kept = [raw(f"greedy{number}") for number in range(4)]
     one_more = raw("greedy4", greet=False)
-    send_frame(one_more, greeting_of("greedy4", "tester"), kind=Kind.OPEN)
+    send_frame(one_more, greeting_of("greedy4", "tester"), kind=FrameKind.OPEN)
     kind, text, _ = Stream(one_more).receive()
     folder = raw.shard._shared.path
     other = program(OPENS, folder / "socket", "modest")
 
-    assert kind == Kind.REFUSED
+    assert kind == FrameKind.REFUSED
     assert b"the last 4 are reserved for others" in text
-    assert other.stdout.readline() == f"{int(Kind.OPENED)}\n"
+    assert other.stdout.readline() == f"{int(FrameKind.OPENED)}\n"
     assert counters(raw.shard)["quota_refused"] == 1
     kept[0].close()
     kept[1].close()
@@ -140,7 +140,7 @@ def test_session_of_one_process_is_not_opened_by_another_one(raw, program):
     mine = raw("mine")
     other = program(OPENS, raw.shard._shared.path / "socket", "mine")
 
-    assert other.stdout.readline() == f"{int(Kind.REFUSED)}\n"
+    assert other.stdout.readline() == f"{int(FrameKind.REFUSED)}\n"
     text = other.stdout.readline()
     assert f"belongs to process {os.getpid()} of user" in text
     assert f"process {other.pid} of user" in text
@@ -173,7 +173,7 @@ def test_place_of_a_client_that_left_before_its_greeting_was_answered_is_free(
 
     monkeypatch.setattr(socket_service.SocketService, "admit", admit_late)
     for near in nears:
-        send_frame(near, greeting_of("hasty", "tester"), kind=Kind.OPEN)
+        send_frame(near, greeting_of("hasty", "tester"), kind=FrameKind.OPEN)
     until(lambda: len(left) == 3)
     for near in nears:
         near.close()
@@ -232,11 +232,11 @@ def test_shard_serves_no_stranger(raw):
     """A peer that is neither the shard's user nor root gets no connection."""
     raw.shard._sockets._users = frozenset((123_456,))
     near = raw(greet=False)
-    send_frame(near, greeting_of("stranger", "tester"), kind=Kind.OPEN)
+    send_frame(near, greeting_of("stranger", "tester"), kind=FrameKind.OPEN)
 
     kind, text, _ = Stream(near).receive()
 
-    assert (kind, b"for user 123456" in text) == (Kind.REFUSED, True)
+    assert (kind, b"for user 123456" in text) == (FrameKind.REFUSED, True)
 
 
 def test_service_ends_in_time_though_its_threads_do_not(raw, monkeypatch):

@@ -24,7 +24,7 @@ from enact_dist.link.notices import Interest
 from enact_dist.link.socket import connection as socket_connection
 from enact_dist.link.socket import service as socket_service
 from enact_dist.link.socket import watcher as socket_watcher
-from enact_dist.link.socket.frames import Kind, Stream, read_skipped, send_frame
+from enact_dist.link.socket.frames import FrameKind, Stream, read_skipped, send_frame
 from enact_dist.terms import Access
 from enact_dist.wire.frames import decode_frame, encode_frame
 
@@ -117,7 +117,7 @@ def test_watcher_that_does_not_read_delays_no_commit(raw, make_peer, monkeypatch
     """Notices are kept for it up to a number, then dropped and counted; commits go on."""
     monkeypatch.setattr(socket_watcher, "NOTICES_MAX", 100)
     watcher, writer = raw("watcher"), raw("writer")
-    send_frame(watcher, b"", kind=Kind.WATCH)
+    send_frame(watcher, b"", kind=FrameKind.WATCH)
     stream = Stream(writer)
     peer = make_peer(lambda _, message: ask(writer, message, stream), session="writer")
     peer.hello()
@@ -133,9 +133,9 @@ def test_watcher_that_reads_again_gets_all_that_was_kept_for_it(raw, monkeypatch
     near = raw("watcher")
     (connection,) = raw.shard._sockets._connections["watcher"]
     connection.connected.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1)
-    send_frame(near, b"", kind=Kind.WATCH)
+    send_frame(near, b"", kind=FrameKind.WATCH)
     stream = Stream(near)
-    assert stream.receive()[0] == Kind.OPENED
+    assert stream.receive()[0] == FrameKind.OPENED
     (watcher,) = raw.shard._sockets._watchers
     until(lambda: not watcher._waiting)
     sent = [Notice("s0", raw.shard.host.epoch, number, ()) for number in range(1, 1001)]
@@ -219,11 +219,11 @@ def test_watcher_is_welcomed_before_its_first_notice(raw, monkeypatch):
     monkeypatch.setattr(socket_service.SocketService, "watch", watch_and_publish)
     near = raw("watcher")
     stream = Stream(near)
-    send_frame(near, b"", kind=Kind.WATCH)
+    send_frame(near, b"", kind=FrameKind.WATCH)
 
     first, second = stream.receive(), stream.receive()
 
-    assert (first[0], second[0]) == (Kind.OPENED, Kind.MESSAGE)
+    assert (first[0], second[0]) == (FrameKind.OPENED, FrameKind.MESSAGE)
     assert decode_frame(*second[1:]) == notice
 
 
@@ -232,8 +232,8 @@ def test_watcher_gets_what_it_watches_and_the_numbers_of_the_rest(raw):
     near = raw("watcher")
     stream = Stream(near)
     interest, _ = encode_frame(Survey(("online",), ("cup",), ("count",)))
-    send_frame(near, interest, kind=Kind.WATCH)
-    assert stream.receive()[0] == Kind.OPENED
+    send_frame(near, interest, kind=FrameKind.WATCH)
+    assert stream.receive()[0] == FrameKind.OPENED
     service, epoch = raw.shard._sockets, raw.shard.host.epoch
 
     def publish(number, entity):
@@ -244,7 +244,7 @@ def test_watcher_gets_what_it_watches_and_the_numbers_of_the_rest(raw):
         publish(number, entity)
 
     kinds, headers, _ = zip(*(stream.receive() for _ in range(3)), strict=True)
-    assert kinds == (Kind.SKIPPED, Kind.MESSAGE, Kind.SKIPPED)
+    assert kinds == (FrameKind.SKIPPED, FrameKind.MESSAGE, FrameKind.SKIPPED)
     assert read_skipped(headers[0]) == (epoch, 10, 12)
     assert decode_frame(headers[1], b"").number == 13
     assert read_skipped(headers[2]) == (epoch, 13, 14)
@@ -255,10 +255,10 @@ def test_watcher_that_says_nonsense_is_refused(raw):
     near = raw("watcher")
     header, _ = encode_frame(ListLocks())
 
-    send_frame(near, header, kind=Kind.WATCH)
+    send_frame(near, header, kind=FrameKind.WATCH)
 
     kind, text, _ = Stream(near).receive()
-    assert kind == Kind.REFUSED
+    assert kind == FrameKind.REFUSED
     assert b"ListLocks came instead of what to watch" in text
 
 

@@ -23,7 +23,7 @@ from enact_dist.core.protocol.records import (
 from enact_dist.errors import StoreError
 from enact_dist.link.folder.lock import FORMAT, FORMAT_READ_MIN
 from enact_dist.link.store.fields import pack
-from enact_dist.link.store.rows import Key, Kind, row_checksum
+from enact_dist.link.store.rows import Key, RowKind, row_checksum
 from enact_dist.link.store.states import OUTCOMES_KEPT_NS
 from enact_dist.link.store.store import open_store
 from enact_dist.terms import Durability, NullReason
@@ -276,7 +276,10 @@ def test_folder_of_the_format_before_is_read_and_marked(tmp_path):
     store.close()
     (tmp_path / "format").write_text(f"enact-dist store {FORMAT_READ_MIN}\n")
     with sqlite3.connect(tmp_path / "store.db") as database:
-        for kind, body in ((Kind.SESSION, pack([5])), (Kind.AUDIT, pack([3, "broken", "broken"]))):
+        for kind, body in (
+            (RowKind.SESSION, pack([5])),
+            (RowKind.AUDIT, pack([3, "broken", "broken"])),
+        ):
             found = database.execute("SELECT key, batch FROM record WHERE kind = ?", (kind,))
             ((name, batch),) = found
             crc = row_checksum(Key(kind, name), batch, body)

@@ -3,7 +3,7 @@
 import tracemalloc
 
 from enact_dist.core.protocol.datum import LockId
-from enact_dist.link.store.rows import Kind, key_of
+from enact_dist.link.store.rows import RowKind, key_of
 from enact_dist.link.store.states import OUTCOMES_KEPT_NS, Outcomes
 
 DAY_NS = OUTCOMES_KEPT_NS
@@ -17,11 +17,11 @@ def test_outcomes_of_sessions_that_ended_a_day_ago_are_forgotten_once():
 
     gone = list(outcomes.expired(DAY_NS + 20))
 
-    a, b = (key_of(Kind.ENDED, session) for session in "ab")
-    lanes = [key_of(Kind.OUTCOME, *lane) for lane in (("a", 3), ("b", 0))]
+    a, b = (key_of(RowKind.ENDED, session) for session in "ab")
+    lanes = [key_of(RowKind.OUTCOME, *lane) for lane in (("a", 3), ("b", 0))]
     assert gone == [a, lanes[0], b, lanes[1]]
     assert list(outcomes.expired(DAY_NS + 20)) == []
-    assert list(outcomes.expired(2 * DAY_NS)) == [key_of(Kind.ENDED, "c")]
+    assert list(outcomes.expired(2 * DAY_NS)) == [key_of(RowKind.ENDED, "c")]
 
 
 def test_end_of_a_session_costs_the_same_however_many_ended_today():

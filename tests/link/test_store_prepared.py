@@ -18,7 +18,7 @@ from enact_dist.core.protocol.records import (
     SlotRecord,
 )
 from enact_dist.errors import StoreError
-from enact_dist.link.store.rows import Kind, key_of
+from enact_dist.link.store.rows import RowKind, key_of
 from enact_dist.link.store.store import open_store
 from enact_dist.terms import Durability
 
@@ -183,7 +183,7 @@ def test_row_of_a_prepared_lock_that_cannot_be_read_is_refused_by_name(tmp_path,
     """As any other damaged row, though it is read last: a `StoreError`, not msgpack's own."""
     monkeypatch.setattr(
         "enact_dist.link.store.batch.row_of",
-        lambda record: (key_of(Kind.PREPARED, *record.lock), body),
+        lambda record: (key_of(RowKind.PREPARED, *record.lock), body),
     )
     with pytest.raises(StoreError, match=r"the prepared lock ann\.3\.4 cannot be read"):
         kept(tmp_path, prepared())

@@ -10,6 +10,7 @@ import typing
 from pathlib import Path
 
 import msgpack
+import numpy as np
 import pytest
 
 from enact_dist import errors
@@ -19,7 +20,8 @@ from enact_dist.link.refusals import error_of
 from enact_dist.link.socket import frames as stream
 from enact_dist.terms import Access
 from enact_dist.wire import limits, tree_writer
-from enact_dist.wire.frames import decode_frame, encode_frame
+from enact_dist.wire.frames import CODES, decode_frame, encode_frame
+from enact_dist.wire.payload import encode_datum
 
 PAGE = Path(__file__).parents[2] / "enact_dist" / "docs" / "protocol.md"
 TEXT = PAGE.read_text("utf-8")
@@ -112,6 +114,11 @@ def test_messages_have_the_codes_and_fields_of_the_page(heading, kinds):
     compare(heading, [(code_of(kind), kind.__name__, fields_text(kind)) for kind in kinds], 3)
 
 
+def test_each_message_stands_on_the_page():
+    """No code belongs to a message that no table has."""
+    assert set(CODES) == {*REQUESTS, *ANSWERS, m.Notice}
+
+
 def test_each_request_names_answers_that_there_are():
     """A reader in another language knows what may come."""
     names = {kind.__name__ for kind in ANSWERS}
@@ -162,9 +169,31 @@ def test_versions_are_those_of_the_page():
     )
 
 
+def test_text_names_the_version_that_a_datum_begins_with():
+    """A reader in another language compares it with the first byte."""
+    assert f"two msgpack objects: the version {limits.DATUM_VERSION} and the tree" in TEXT
+    assert encode_datum(5, int).encoding[0] == limits.DATUM_VERSION
+
+
+def test_examples_of_data_are_what_is_sent():
+    """The int 5 and three float64."""
+    five, floats = encode_datum(5, int), encode_datum(np.zeros(3), np.ndarray)
+    unpacker = msgpack.Unpacker(ext_hook=msgpack.ExtType)
+    unpacker.feed(floats.encoding)
+    version, array = unpacker
+    content = str(msgpack.unpackb(array.data)).replace("'", '"')
+
+    assert bytes(five.body) == b""
+    assert f"the int 5 is `{five.encoding.hex(' ')}` with an empty body" in TEXT
+    assert (
+        f"Three float64 are `{version:02x}` and ext {array.code} with `{content}`, "
+        f"and {floats.size} bytes of body"
+    ) in TEXT
+
+
 def test_frames_of_a_stream_have_the_kinds_of_the_page():
     """And the prefix is as long as it says."""
-    compare("Frames of a stream", [(int(kind), kind.name) for kind in stream.Kind], 2)
+    compare("Frames of a stream", [(int(kind), kind.name) for kind in stream.FrameKind], 2)
     prefix = stream.prefixed(b"", 0)
     assert f"{stream.PREFIX_BYTES} bytes" in TEXT
     assert f"`{prefix[:3].hex(' ')}`" in TEXT

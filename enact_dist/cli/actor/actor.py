@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.cli.target import cell_config, see_modules
-from enact_dist.cli.text.output import print_json, shown_s
+from enact_dist.cli.text.output import print_json
 from enact_dist.cli.verbs import DONE, FAILED, Output
 from enact_dist.errors import ConfigError, EnactError, ProtocolError
+from enact_dist.world.trees import shown_s
 
 if TYPE_CHECKING:
     import argparse

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from enact_dist.config.types import CellConfig
-    from enact_dist.link.offline.forgetting import Forgotten
+    from enact_dist.link.offline.forgetting import Purged
 
 
 def run_forget(options: argparse.Namespace) -> int:
@@ -112,7 +112,7 @@ def _folders(
     return folders, elsewhere
 
 
-def _facts(found: Forgotten, elsewhere: list[str], *, done: bool) -> dict[str, Any]:
+def _facts(found: Purged, elsewhere: list[str], *, done: bool) -> dict[str, Any]:
     return {
         "done": done,
         "resumed": found.resumed,
@@ -124,7 +124,7 @@ def _facts(found: Forgotten, elsewhere: list[str], *, done: bool) -> dict[str, A
     }
 
 
-def _end(found: Forgotten) -> str:
+def _end(found: Purged) -> str:
     slots, versions = sum(g.slots for g in found.going), sum(g.versions for g in found.going)
     names = ", ".join(found.aspects or found.done)
     worlds = f"{len(found.worlds)} world contexts without data" if found.worlds else ""
@@ -149,7 +149,7 @@ class _Told:
         self._as_json = as_json
         self._goes = goes
 
-    def found(self, found: Forgotten) -> None:
+    def found(self, found: Purged) -> None:
         """Say what goes.
 
         Raises:

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.cli.arguments import pairs
 from enact_dist.cli.target import cell_config
-from enact_dist.cli.text.output import ProgressLine, print_json, print_table, shown_bytes, shown_s
+from enact_dist.cli.text.output import ProgressLine, print_json, print_table, shown_bytes
 from enact_dist.cli.verbs import DONE
 from enact_dist.errors import ConfigError, StoreError
+from enact_dist.world.trees import shown_s
 
 if TYPE_CHECKING:
     import argparse

@@ -7,11 +7,12 @@ import sys
 from typing import TYPE_CHECKING
 
 from enact_dist.cli.target import cell_target, is_endpoint, open_cell
-from enact_dist.cli.text.output import print_table, shown_bytes, shown_s
+from enact_dist.cli.text.output import print_table, shown_bytes
 from enact_dist.cli.verbs import DONE, FAILED, UNREACHABLE, Output
 from enact_dist.core.state.clock import state_of
 from enact_dist.errors import ConfigError
-from enact_dist.link.daemon.counters import told
+from enact_dist.link.daemon.counters import described
+from enact_dist.world.trees import shown_s
 
 if TYPE_CHECKING:
     import argparse
@@ -84,7 +85,7 @@ def list_shards(options: argparse.Namespace) -> Output:
 def _print_counters(shards: Sequence[ShardInfo]) -> None:
     print_table(
         ("shard", "counter", "value", "meaning", "what to do"),
-        [(shard.name, *row) for shard in shards for row in told(shard.counters)],
+        [(shard.name, *row) for shard in shards for row in described(shard.counters)],
         empty="no counters",
     )
 

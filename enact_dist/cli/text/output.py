@@ -1,20 +1,18 @@
-"""Tables, trees and JSON on standard output: for people on a terminal, plain text into a pipe."""
+"""Tables and JSON on standard output: for people on a terminal, plain text into a pipe."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import sys
 import time
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.wire.texts import shown, shown_json
+from enact_dist.world.trees import on_terminal
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
-    from typing import IO
 
 COLOURS = ("36", "33", "35", "32", "34", "31", "96", "93", "95", "92")
 """ANSI colours of log prefixes, in turn."""
@@ -25,12 +23,6 @@ TABLE_PADDING = 3
 
 TOLD_EVERY_S: Final = 0.2
 """How often a line of progress is written over."""
-
-
-def on_terminal(out: IO[str] | None = None) -> bool:
-    """Say whether a stream (None: standard output) is a terminal that shows colours."""
-    out = out if out is not None else sys.stdout
-    return out.isatty() and "NO_COLOR" not in os.environ and os.environ.get("TERM") != "dumb"
 
 
 def print_json(value: object) -> None:
@@ -90,76 +82,6 @@ def _plain_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     for line in lines:
         padded = (cell.ljust(width) for cell, width in zip(line, widths, strict=True))
         print("  ".join(padded).rstrip())
-
-
-@dataclass(slots=True)
-class Branch:
-    """A part of a tree: its own line, and the parts below it by name."""
-
-    label: str
-    children: dict[str, Branch] = field(default_factory=dict)
-
-    def at(self, segments: list[str]) -> Branch:
-        """Return the branch at a path below this one, growing it where needed."""
-        branch = self
-        for segment in segments:
-            branch = branch.children.setdefault(segment, Branch(f"{segment}/"))
-        return branch
-
-    def add(self, branch: Branch) -> None:
-        """Put a branch below this one, after the others."""
-        self.children[str(len(self.children))] = branch
-
-
-def print_tree(root: Branch, out: IO[str] | None = None) -> None:
-    """Print a tree with its root as the first line.
-
-    Args:
-        root: Of the tree.
-        out: Where to; None: standard output.
-    """
-    out = out if out is not None else sys.stdout
-    if on_terminal(out):
-        _rich_tree(root, out)
-    else:
-        _plain_tree(root, 0, out)
-
-
-def _plain_tree(branch: Branch, depth: int, out: IO[str]) -> None:
-    print(f"{'  ' * depth}{shown(branch.label)}", file=out)
-    for child in branch.children.values():
-        _plain_tree(child, depth + 1, out)
-
-
-def _rich_tree(root: Branch, out: IO[str]) -> None:
-    from rich.console import Console
-    from rich.text import Text
-    from rich.tree import Tree
-
-    def grow(tree: Tree, branch: Branch) -> None:
-        for child in branch.children.values():
-            grow(tree.add(Text(shown(child.label))), child)
-
-    tree = Tree(Text(shown(root.label), style="bold"))
-    grow(tree, root)
-    Console(file=out).print(tree)
-
-
-# ---------------------------------------------------------------- units for people
-
-
-def shown_s(value_s: float) -> str:
-    """Return a duration as people read it: ``12 ms``, ``3.4 s``, ``2 h 5 min``."""
-    if value_s < 1.0:
-        return f"{value_s * 1e3:.0f} ms" if value_s >= 0.01 else f"{value_s * 1e3:.1f} ms"
-    if value_s < 60.0:
-        return f"{value_s:.1f} s"
-    minutes, rest_s = divmod(round(value_s), 60)
-    hours, minutes = divmod(minutes, 60)
-    days, hours = divmod(hours, 24)
-    if days:
-        return f"{days} d {hours} h"
-    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest_s} s"
 
 
 def shown_bytes(size_bytes: float) -> str:

@@ -7,11 +7,12 @@ import time
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.cli.text.output import Branch, print_tree, shown_bytes, shown_s
+from enact_dist.cli.text.output import shown_bytes
 from enact_dist.cli.verbs import Output
 from enact_dist.config.table import suggestion
 from enact_dist.errors import EnactError, NullDatumError
 from enact_dist.terms import NullReason
+from enact_dist.world.trees import Branch, print_tree, shown_s
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from enact_dist.cli.text.output import shown_bytes, shown_s
+from enact_dist.cli.text.output import shown_bytes
 from enact_dist.cli.text.slots import datum_output, named_if_missing, slots_output
 from enact_dist.cli.verbs import Output
 from enact_dist.cli.world.time import fork_facts, shown_origin
 from enact_dist.terms import Entities, Entity
+from enact_dist.world.trees import shown_s
 
 if TYPE_CHECKING:
     import argparse

@@ -14,10 +14,11 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.cli.target import cell_target, is_endpoint, open_cell, see_modules
-from enact_dist.cli.text.output import print_table, shown_bytes, shown_s
+from enact_dist.cli.text.output import print_table, shown_bytes
 from enact_dist.cli.verbs import DIFFERENT, DONE, Output
 from enact_dist.errors import ConfigError
 from enact_dist.terms import Aspect
+from enact_dist.world.trees import shown_s
 
 if TYPE_CHECKING:
     import argparse

@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 from enact_dist.cli.arguments import entities, slot_name
 from enact_dist.cli.target import open_cell
-from enact_dist.cli.text.output import shown_bytes, shown_s
+from enact_dist.cli.text.output import shown_bytes
 from enact_dist.cli.text.slots import datum_output, missing, named_if_missing, slots_output
 from enact_dist.cli.text.times import shown_position
 from enact_dist.cli.verbs import DONE, FAILED, Output
 from enact_dist.errors import ConfigError, ForgottenError
 from enact_dist.link.refusals import moment_name
 from enact_dist.terms import Aspect, Entity
+from enact_dist.world.trees import shown_s
 
 if TYPE_CHECKING:
     from enact_dist.world.cell import Cell

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from enact_dist.access.watch import Watch
 from enact_dist.cli.target import open_cell
-from enact_dist.cli.text.output import print_json_line, print_table, shown_bytes, shown_s
+from enact_dist.cli.text.output import print_json_line, print_table, shown_bytes
 from enact_dist.cli.text.rates import Rates, Sample
 from enact_dist.cli.verbs import DONE
 from enact_dist.config.table import suggestion
@@ -18,6 +18,7 @@ from enact_dist.core.protocol.datum import Slot
 from enact_dist.errors import LinkError, ProtocolError, ShardUnreachableError
 from enact_dist.link.signals import StopSignals
 from enact_dist.wire.payload import decode_untyped
+from enact_dist.world.trees import shown_s
 from enact_dist.world.version_data import Wanted, explained, found_of
 
 if TYPE_CHECKING:

@@ -159,7 +159,7 @@ CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 
 
 class Metric(NamedTuple):
-    """One metric: its name in Prometheus and in the figures of a `ShardHost`; see `Counter`."""
+    """One metric: its name in Prometheus and in the figures of a `ShardHost`; see `Figure`."""
 
     name: str
     figure: str

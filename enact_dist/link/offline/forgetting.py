@@ -30,14 +30,14 @@ if TYPE_CHECKING:
 class PurgeProgress(Protocol):
     """Reports what is purged, and the progress."""
 
-    def found(self, forgotten: Forgotten) -> None:
+    def found(self, found: Purged) -> None:
         """Take what will be purged; nothing has changed yet, and an exception keeps it so."""
 
     def act(self, name: str) -> None:
         """Take the next step; it is durable before the one after."""
 
 
-class Forgotten(NamedTuple):
+class Purged(NamedTuple):
     """What was purged, or would be.
 
     Attributes:
@@ -64,7 +64,7 @@ def look(
     *,
     unused: Collection[str] | None = None,
     progress: PurgeProgress | None = None,
-) -> Forgotten:
+) -> Purged:
     """Return what `forget` would purge; change nothing.
 
     Args:
@@ -91,7 +91,7 @@ def forget(
     now_ns: int,
     unused: Collection[str] | None = None,
     progress: PurgeProgress | None = None,
-) -> Forgotten:
+) -> Purged:
     """Purge aspects, with all data that these shards have of them.
 
     Args:
@@ -135,7 +135,7 @@ def _plan(
     *,
     now_ns: int,
     unused: Collection[str] | None,
-) -> tuple[Forgotten, PurgePlan]:
+) -> tuple[Purged, PurgePlan]:
     """Return the plan; aspects of an interrupted run are purged as well.
 
     Raises:
@@ -149,7 +149,7 @@ def _plan(
     plan = planned(stored, aspects, now_ns=now_ns, begun=begun)
     refuse_obstacles("nothing was forgotten", plan.obstacles)
     known = plan.known | begun.keys()  # a restore may have removed all traces of the run
-    return Forgotten(plan.names, known, plan.going, bool(begun), plan.done, worlds), plan
+    return Purged(plan.names, known, plan.going, bool(begun), plan.done, worlds), plan
 
 
 def _begun(folders: Mapping[str, Path]) -> dict[str, int]:
@@ -162,7 +162,7 @@ def _begun(folders: Mapping[str, Path]) -> dict[str, int]:
     return {name: at_ns for each in marks.values() for name, at_ns in each.aspects.items()}
 
 
-def _refuse_unknown(found: Forgotten) -> None:
+def _refuse_unknown(found: Purged) -> None:
     unknown = [name for name in found.aspects if name not in found.known]
     if unknown:
         raise MisuseError(

@@ -19,7 +19,7 @@ from enact_dist.link.answers import encoded, size_of
 from enact_dist.link.notices import Interest
 from enact_dist.link.socket.frames import (
     BUFFER_BYTES,
-    Kind,
+    FrameKind,
     Stream,
     end_socket,
     prefixed,
@@ -27,7 +27,7 @@ from enact_dist.link.socket.frames import (
     send_frame,
     wait_at_most,
 )
-from enact_dist.link.socket.peers import Peer
+from enact_dist.link.socket.peers import PeerCredentials
 from enact_dist.link.socket.watcher import Publisher, SocketWatcher
 from enact_dist.patterns import checked_patterns
 from enact_dist.wire.frames import decode_frame, decode_request, encode_parts
@@ -49,7 +49,7 @@ class Admission(Publisher, Protocol):
     def left(self, connection: SocketConnection, session: str) -> None:
         """Record the end of an admitted connection."""
 
-    def is_of_another_process(self, session: str, peer: Peer) -> bool:
+    def is_of_another_process(self, session: str, peer: PeerCredentials) -> bool:
         """Whether a session has connections from a process other than this one."""
 
 
@@ -80,7 +80,7 @@ class SocketConnection:
         self._rest: memoryview | None = None
         self.connected = connected
         self.session = self.identity = ""
-        self.peer = Peer(0, 0, 0)
+        self.peer = PeerCredentials(0, 0, 0)
         self.step = 2
         self.ended = threading.Event()
 
@@ -112,7 +112,7 @@ class SocketConnection:
             kind, header, payload = self._stream.receive()
         except BlockingIOError:
             return False
-        if kind != Kind.OPEN or payload:
+        if kind != FrameKind.OPEN or payload:
             raise ProtocolError(f"a frame of kind {kind} came instead of a greeting")
         session, self.identity = read_greeting(header)
         try:
@@ -122,14 +122,16 @@ class SocketConnection:
             self._refuse(error)
             return False
         wait_at_most(self.connected, socket.SO_RCVTIMEO, 0.0)
-        send_frame(self.connected, self._service.host.name.encode(), kind=Kind.OPENED)
+        send_frame(self.connected, self._service.host.name.encode(), kind=FrameKind.OPENED)
         return True
 
     def _refuse(self, error: Exception) -> None:
         self._service.host.count("connections_refused")
         _log.warning("a connection is refused: %s", error)
         try:
-            send_frame(self.connected, str(error).encode()[: BUFFER_BYTES // 2], kind=Kind.REFUSED)
+            send_frame(
+                self.connected, str(error).encode()[: BUFFER_BYTES // 2], kind=FrameKind.REFUSED
+            )
         except OSError:
             return
 
@@ -140,8 +142,8 @@ class SocketConnection:
             self.step = step = step + 1
             kind, header, payload = receive()
             self.step = step = step + 1
-            if kind != Kind.MESSAGE:
-                if kind == Kind.WATCH:
+            if kind != FrameKind.MESSAGE:
+                if kind == FrameKind.WATCH:
                     self.step = step + 1
                     SocketWatcher(self._service, self.connected, _interest(header)).run()
                     return

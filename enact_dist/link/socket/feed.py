@@ -18,7 +18,7 @@ import threading
 from typing import TYPE_CHECKING, Final, Protocol
 
 from enact_dist.errors import LinkError, ProtocolError
-from enact_dist.link.socket.frames import Kind, wait_at_most
+from enact_dist.link.socket.frames import FrameKind, wait_at_most
 from enact_dist.wire.frames import encode_frame
 
 if TYPE_CHECKING:
@@ -155,7 +155,7 @@ class SocketFeed:
         if connection is None:
             return None
         try:
-            connection.exchange(Kind.WATCH, self._watch)
+            connection.exchange(FrameKind.WATCH, self._watch)
         except (LinkError, ProtocolError, EOFError, OSError) as error:
             _log.debug("no notices over the socket to shard %s: %s", line.shard, error)
             line.drop(connection)

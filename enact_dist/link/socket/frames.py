@@ -45,7 +45,7 @@ PREFIX_BYTES: Final = _PREFIX.size
 _TIMEVAL: Final = struct.Struct("ll")
 
 
-class Kind(enum.IntEnum):
+class FrameKind(enum.IntEnum):
     """The kind of a frame."""
 
     OPEN = 1
@@ -65,9 +65,9 @@ class Kind(enum.IntEnum):
     """Shard: these notices were skipped (the header is epoch, first and last)."""
 
 
-_MESSAGE: Final = int(Kind.MESSAGE)
+_MESSAGE: Final = int(FrameKind.MESSAGE)
 _START_OF_MESSAGE: Final = MAGIC + bytes((STREAM_VERSION, _MESSAGE))
-_KINDS: Final = frozenset(int(kind) for kind in Kind)
+_KINDS: Final = frozenset(int(kind) for kind in FrameKind)
 
 
 _SKIPPED: Final = struct.Struct("<QQQ")
@@ -93,7 +93,7 @@ def read_greeting(header: bytes) -> tuple[str, str]:
 
 def skipped_frame(epoch: int, after: int, number: int) -> bytes:
     """Return the frame that tells which notices of an epoch were skipped."""
-    return prefixed(_SKIPPED.pack(epoch, after, number), 0, Kind.SKIPPED)
+    return prefixed(_SKIPPED.pack(epoch, after, number), 0, FrameKind.SKIPPED)
 
 
 def read_skipped(header: bytes) -> tuple[int, int, int]:

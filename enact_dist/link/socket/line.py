@@ -23,7 +23,7 @@ from enact_dist.link.memory.shared_folder import open_shared
 from enact_dist.link.notices import Skipped
 from enact_dist.link.socket.frames import (
     Buffer,
-    Kind,
+    FrameKind,
     Stream,
     read_skipped,
     rounded_s,
@@ -104,14 +104,14 @@ class Connection:
         if threading.get_ident() == self._main and not self._poll.poll(self._wait_s * 1e3):
             raise BlockingIOError(errno.EAGAIN, "no answer in time")
         kind, header, payload = self._stream.receive(into)
-        if kind != Kind.MESSAGE:
+        if kind != FrameKind.MESSAGE:
             raise ProtocolError(
                 f"shard {self.shard} sent a frame of kind {kind} instead of an answer"
                 f" ({header.decode('utf-8', 'replace')})"
             )
         return decode_answer(self.shard, header, payload)
 
-    def exchange(self, kind: Kind, header: bytes) -> None:
+    def exchange(self, kind: FrameKind, header: bytes) -> None:
         """Send a frame and wait for the shard's acceptance.
 
         Raises:
@@ -122,11 +122,11 @@ class Connection:
         """
         send_frame(self.socket, header, kind=kind)
         kind_of_answer, text, _ = self._stream.receive()
-        if kind_of_answer == Kind.REFUSED:
+        if kind_of_answer == FrameKind.REFUSED:
             raise LinkError(text.decode("utf-8", "replace"))
-        if kind_of_answer != Kind.OPENED:
+        if kind_of_answer != FrameKind.OPENED:
             raise ProtocolError(f"a frame of kind {kind_of_answer} came instead of a greeting")
-        if kind == Kind.OPEN and text != self.shard.encode():
+        if kind == FrameKind.OPEN and text != self.shard.encode():
             raise LinkError(f"shard {text!r} answers at the socket of {self.shard}")
 
     def fileno(self) -> int:
@@ -152,9 +152,9 @@ class Connection:
         return found
 
     def _notice(self, kind: int, header: bytes, payload: Buffer) -> Notice | Skipped:
-        if kind == Kind.SKIPPED:
+        if kind == FrameKind.SKIPPED:
             return Skipped(self.shard, *read_skipped(header))
-        notice = decode_frame(header, payload) if kind == Kind.MESSAGE else None
+        notice = decode_frame(header, payload) if kind == FrameKind.MESSAGE else None
         if not isinstance(notice, Notice):
             raise ProtocolError(f"{type(notice).__name__} came instead of a notice")
         return notice
@@ -282,7 +282,7 @@ class SocketLine:
             connected.connect(folder.address(SOCKET_NAME))
             check_peer(connected, users=frozenset((folder.owner, os.geteuid())), group=None)
             connection = Connection(self.shard, connected)
-            connection.exchange(Kind.OPEN, self._greeting)
+            connection.exchange(FrameKind.OPEN, self._greeting)
             wait_at_most(connected, socket.SO_SNDTIMEO, SEND_S)
         except BaseException:
             connected.close()

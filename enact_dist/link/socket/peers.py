@@ -32,7 +32,7 @@ JOIN_S: Final = 0.5
 _log = logging.getLogger("enact.link")
 
 
-class Peer(NamedTuple):
+class PeerCredentials(NamedTuple):
     """The process that connected, as the kernel recorded it then (-1 or 0: not visible here)."""
 
     pid: int
@@ -40,14 +40,16 @@ class Peer(NamedTuple):
     group: int
 
 
-def peer_of(connected: socket.socket) -> Peer:
+def peer_of(connected: socket.socket) -> PeerCredentials:
     """Return the process at the other end."""
     size = _CREDENTIALS.size
     raw = connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, size)
-    return Peer(*_CREDENTIALS.unpack(raw))
+    return PeerCredentials(*_CREDENTIALS.unpack(raw))
 
 
-def check_peer(connected: socket.socket, *, users: frozenset[int], group: int | None) -> Peer:
+def check_peer(
+    connected: socket.socket, *, users: frozenset[int], group: int | None
+) -> PeerCredentials:
     """Return the process at the other end if its user is in `users` or its group is `group`.
 
     Raises:
@@ -65,7 +67,7 @@ def check_peer(connected: socket.socket, *, users: frozenset[int], group: int | 
     )
 
 
-def _groups_of(connected: socket.socket, peer: Peer) -> frozenset[int]:
+def _groups_of(connected: socket.socket, peer: PeerCredentials) -> frozenset[int]:
     try:
         raw = connected.getsockopt(socket.SOL_SOCKET, _SO_PEERGROUPS, 4 * GROUPS_MAX)
     except OSError:

@@ -24,7 +24,7 @@ from enact_dist.core.shard.owners import not_yours
 from enact_dist.errors import LinkError
 from enact_dist.link.socket.connection import SocketConnection
 from enact_dist.link.socket.frames import end_socket, prefixed
-from enact_dist.link.socket.peers import Deaths, Peer, check_peer
+from enact_dist.link.socket.peers import Deaths, PeerCredentials, check_peer
 from enact_dist.wire.frames import encode_frame
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ class SocketService:
         self._closing = threading.Event()
         self._mutex = threading.Lock()
         self._connections: dict[str, set[SocketConnection]] = {}
-        self._processes: Counter[Peer] = Counter()
+        self._processes: Counter[PeerCredentials] = Counter()
         self._count = 0
         self._watchers: tuple[SocketWatcher, ...] = ()
         self._listener = _listen(folder)
@@ -140,7 +140,9 @@ class SocketService:
             raise LinkError(problem)
         self._deaths.connected(session, connection.connected)
 
-    def _problem_with(self, session: str, mine: set[SocketConnection], peer: Peer) -> str:
+    def _problem_with(
+        self, session: str, mine: set[SocketConnection], peer: PeerCredentials
+    ) -> str:
         """Return why a process may not open another connection for a session; "" if it may."""
         other = next((one.peer for one in mine if one.peer != peer), None)
         if other is not None:
@@ -155,12 +157,12 @@ class SocketService:
             return f"{CONNECTIONS_MAX} connections to shard {self.host.name} are open"
         return ""
 
-    def is_of_another_process(self, session: str, peer: Peer) -> bool:
+    def is_of_another_process(self, session: str, peer: PeerCredentials) -> bool:
         """Whether a session has connections from a process other than this one."""
         with self._mutex:
             return any(one.peer != peer for one in self._connections.get(session, ()))
 
-    def _has_its_share(self, peer: Peer) -> bool:
+    def _has_its_share(self, peer: PeerCredentials) -> bool:
         """Whether a process must leave the free connections to others."""
         free = CONNECTIONS_MAX - self._count
         return self._processes[peer] >= PROCESS_CONNECTIONS_MAX and free <= KEPT_FREE

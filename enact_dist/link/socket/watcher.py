@@ -18,7 +18,7 @@ from collections import deque
 from typing import TYPE_CHECKING, Final, Protocol
 
 from enact_dist.link.notices import Skipped
-from enact_dist.link.socket.frames import Kind, prefixed, skipped_frame
+from enact_dist.link.socket.frames import FrameKind, prefixed, skipped_frame
 
 if TYPE_CHECKING:
     from enact_dist.core.protocol.messages import Notice
@@ -63,7 +63,7 @@ class SocketWatcher:
         self._connected = connected
         self._mutex = threading.Lock()
         # The first frame sent, even if a commit is published at this moment.
-        self._waiting = deque([memoryview(prefixed(b"", 0, Kind.OPENED))])
+        self._waiting = deque([memoryview(prefixed(b"", 0, FrameKind.OPENED))])
         self._bell = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
 
     def put(self, notice: Notice, frame: bytes) -> None:

@@ -31,7 +31,7 @@ from enact_dist.link.folder.blobs import Blob
 from enact_dist.link.store.rows import (
     INLINE_BYTES_MAX,
     Key,
-    Kind,
+    RowKind,
     RowOrder,
     cause_body,
     cause_key,
@@ -116,11 +116,11 @@ class Batch:
                     for slot, version in record.versions:
                         self._forget(slot, version)
                 case WorldDropped():
-                    self.changes[key_of(Kind.WORLD, record.name)] = None
+                    self.changes[key_of(RowKind.WORLD, record.name)] = None
                     self._remove_all("context", {record.name})
                     self._put(record)
                 case AspectForgotten():
-                    self.changes[key_of(Kind.ASPECT, record.name)] = None
+                    self.changes[key_of(RowKind.ASPECT, record.name)] = None
                     self._remove_all("aspect", {record.name})
                     self._put(record)
                 case EntitiesMoved():
@@ -198,7 +198,7 @@ class Batch:
 
     def _end_prepared(self, lock: LockId) -> None:
         """Delete a prepared lock; the slots that it has set take over its files."""
-        self.changes[key_of(Kind.PREPARED, *lock)] = None
+        self.changes[key_of(RowKind.PREPARED, *lock)] = None
         for key, write in self._states.prepared.pop(lock, {}).items():
             newest = self._states.newest.get(write.slot)
             staged = self._staged.get(newest.key) if newest is not None else None
@@ -212,22 +212,22 @@ class Batch:
         """Record the change of a record's own row."""
         match record:
             case DecisionDone():
-                self.changes[key_of(Kind.DECISION, *record.lock)] = None
+                self.changes[key_of(RowKind.DECISION, *record.lock)] = None
                 return
             case ForcedEnded():
-                self.changes[key_of(Kind.FORCED, *record.lock)] = None
+                self.changes[key_of(RowKind.FORCED, *record.lock)] = None
                 return
             case SessionRecord() if self._outcomes.came_back(record.session):
-                self.changes[key_of(Kind.ENDED, record.session)] = None
+                self.changes[key_of(RowKind.ENDED, record.session)] = None
             case SessionEnded():
-                self.changes[key_of(Kind.SESSION, record.session)] = None
+                self.changes[key_of(RowKind.SESSION, record.session)] = None
                 self.changes.update(dict.fromkeys(self._outcomes.expired(record.wall_ns)))
                 self._outcomes.ended(record.session, record.wall_ns)
             case OutcomeRecord():
                 self._outcomes.add(record.lock)
         key, body = row_of(record)
         if isinstance(record, AuditRecord):
-            key = key_of(Kind.AUDIT, *self._next())
+            key = key_of(RowKind.AUDIT, *self._next())
         gone = isinstance(record, KeptRecord) and not record.versions
         self.changes[key] = None if gone else body
 

@@ -26,7 +26,7 @@ from enact_dist.link.folder.folder import refuse
 from enact_dist.link.store.fields import DamagedRowError
 from enact_dist.link.store.rows import (
     Key,
-    Kind,
+    RowKind,
     RowOrder,
     StoredSlot,
     cause_key,
@@ -64,15 +64,15 @@ _UNREADABLE: Final = (
 """Exceptions that mean a damaged row; none of them is a system error."""
 
 _LISTS: Final = {
-    Kind.SESSION: "sessions",
-    Kind.WORLD: "worlds",
-    Kind.DROPPED: "dropped",
-    Kind.ASPECT: "aspects",
-    Kind.FORGOTTEN: "forgotten",
-    Kind.KEPT: "kept",
-    Kind.OUTCOME: "outcomes",
-    Kind.DECISION: "decisions",
-    Kind.FORCED: "forced",
+    RowKind.SESSION: "sessions",
+    RowKind.WORLD: "worlds",
+    RowKind.DROPPED: "dropped",
+    RowKind.ASPECT: "aspects",
+    RowKind.FORGOTTEN: "forgotten",
+    RowKind.KEPT: "kept",
+    RowKind.OUTCOME: "outcomes",
+    RowKind.DECISION: "decisions",
+    RowKind.FORCED: "forced",
 }
 """The lists of `Recovered` that rows go to as they are."""
 
@@ -135,29 +135,29 @@ def read_contents(database: Database, path: Path) -> Contents:
 
 
 def _read_row(row: DatabaseRow, contents: Contents) -> None:
-    key = Key(Kind(row.kind), row.key)
+    key = Key(RowKind(row.kind), row.key)
     if row_checksum(key, row.batch, row.body) != row.crc:
         raise DamagedRowError("its checksum is wrong")
     if contents.ids.setdefault(key, row.id) != row.id:
         raise DamagedRowError(f"it repeats row {contents.ids[key]}")
     contents.batch = max(contents.batch, row.batch)
     match key.kind:
-        case Kind.EPOCH:
+        case RowKind.EPOCH:
             contents.recovered.epoch = read_epoch(row.body)
-        case Kind.ENDED:
+        case RowKind.ENDED:
             ended = read_record(key, row.body)
             contents.ended[ended.session] = ended.wall_ns
-        case Kind.SLOT:
+        case RowKind.SLOT:
             slot, order = read_slot_key(key)
             _take_state(key, read_slot(slot, row.body), contents)
             contents.orders.setdefault(slot, []).append((order, key))
-        case Kind.CAUSE:
+        case RowKind.CAUSE:
             contents.causes[cause_key(read_order(key))] = read_cause(row.body)
-        case Kind.PREPARED_WRITE:
+        case RowKind.PREPARED_WRITE:
             _take_state(key, read_slot(read_write_key(key)[1], row.body), contents)
-        case Kind.PREPARED:
+        case RowKind.PREPARED:
             contents.prepared[read_lock(key)] = (key, row.body)
-        case Kind.AUDIT:
+        case RowKind.AUDIT:
             contents.acts[read_order(key)] = read_record(key, row.body)
         case _:
             getattr(contents.recovered, _LISTS[key.kind]).append(read_record(key, row.body))
@@ -243,7 +243,7 @@ def put_together(contents: Contents, path: Path) -> None:
     recovered.audit = [act for _, act in sorted(contents.acts.items())]
     writes: dict[LockId, dict[Slot, SlotRecord]] = {lock: {} for lock in contents.prepared}
     for key, record in contents.records.items():
-        if key.kind is Kind.PREPARED_WRITE:
+        if key.kind is RowKind.PREPARED_WRITE:
             lock, slot = read_write_key(key)
             writes.setdefault(lock, {})[slot] = record
     for lock, found in writes.items():

@@ -49,7 +49,7 @@ INLINE_BYTES_MAX: Final = 64 * 1024
 """Bodies up to this size live in their row, larger ones in a file of their own."""
 
 
-class Kind(enum.IntEnum):
+class RowKind(enum.IntEnum):
     """The subject of a row.  The numbers are stored on disk."""
 
     EPOCH = 0
@@ -73,7 +73,7 @@ class Kind(enum.IntEnum):
 class Key(NamedTuple):
     """Identity of a row."""
 
-    kind: Kind
+    kind: RowKind
     name: bytes
 
 
@@ -84,10 +84,10 @@ class RowOrder(NamedTuple):
     number: int
 
 
-EPOCH_KEY: Final = Key(Kind.EPOCH, b"")
+EPOCH_KEY: Final = Key(RowKind.EPOCH, b"")
 
 
-def key_of(kind: Kind, *parts: object) -> Key:
+def key_of(kind: RowKind, *parts: object) -> Key:
     """Return the key of a row of `kind` made of `parts`."""
     return Key(kind, pack(parts))
 
@@ -110,24 +110,24 @@ class _Table(NamedTuple):
         names: How many are in the key; 0: the key is the order of the row.
     """
 
-    kind: Kind
+    kind: RowKind
     layout: RowLayout[Any]
     names: int
 
 
 _TABLES: Final = {
-    SessionRecord: _Table(Kind.SESSION, RowLayout(SessionRecord, open_end=True), 1),
-    SessionEnded: _Table(Kind.ENDED, RowLayout(SessionEnded), 1),
-    WorldRecord: _Table(Kind.WORLD, RowLayout(WorldRecord), 1),
-    WorldDropped: _Table(Kind.DROPPED, RowLayout(WorldDropped, open_end=True), 1),
-    AspectEntry: _Table(Kind.ASPECT, RowLayout(AspectEntry, without="reads", open_end=True), 1),
-    AspectForgotten: _Table(Kind.FORGOTTEN, RowLayout(AspectForgotten, open_end=True), 1),
-    KeptRecord: _Table(Kind.KEPT, RowLayout(KeptRecord), 1),
-    OutcomeRecord: _Table(Kind.OUTCOME, RowLayout(OutcomeRecord), 2),
-    PreparedRecord: _Table(Kind.PREPARED, RowLayout(PreparedRecord, without="writes"), 3),
-    DecisionRecord: _Table(Kind.DECISION, RowLayout(DecisionRecord), 3),
-    ForcedRecord: _Table(Kind.FORCED, RowLayout(ForcedRecord), 3),
-    AuditRecord: _Table(Kind.AUDIT, RowLayout(AuditRecord, open_end=True), 0),
+    SessionRecord: _Table(RowKind.SESSION, RowLayout(SessionRecord, open_end=True), 1),
+    SessionEnded: _Table(RowKind.ENDED, RowLayout(SessionEnded), 1),
+    WorldRecord: _Table(RowKind.WORLD, RowLayout(WorldRecord), 1),
+    WorldDropped: _Table(RowKind.DROPPED, RowLayout(WorldDropped, open_end=True), 1),
+    AspectEntry: _Table(RowKind.ASPECT, RowLayout(AspectEntry, without="reads", open_end=True), 1),
+    AspectForgotten: _Table(RowKind.FORGOTTEN, RowLayout(AspectForgotten, open_end=True), 1),
+    KeptRecord: _Table(RowKind.KEPT, RowLayout(KeptRecord), 1),
+    OutcomeRecord: _Table(RowKind.OUTCOME, RowLayout(OutcomeRecord), 2),
+    PreparedRecord: _Table(RowKind.PREPARED, RowLayout(PreparedRecord, without="writes"), 3),
+    DecisionRecord: _Table(RowKind.DECISION, RowLayout(DecisionRecord), 3),
+    ForcedRecord: _Table(RowKind.FORCED, RowLayout(ForcedRecord), 3),
+    AuditRecord: _Table(RowKind.AUDIT, RowLayout(AuditRecord, open_end=True), 0),
 }
 _BY_KIND: Final = {table.kind: table for table in _TABLES.values()}
 
@@ -254,7 +254,7 @@ def read_slot(slot: Slot, body: bytes) -> StoredSlot:
 
 def slot_key(slot: Slot, order: RowOrder) -> Key:
     """Return the key of the state of a slot that was set then."""
-    return key_of(Kind.SLOT, *slot, *order)
+    return key_of(RowKind.SLOT, *slot, *order)
 
 
 def read_slot_key(key: Key) -> tuple[Slot, RowOrder]:
@@ -265,7 +265,7 @@ def read_slot_key(key: Key) -> tuple[Slot, RowOrder]:
 
 def cause_key(order: RowOrder) -> Key:
     """Return the key of a cause that several states share."""
-    return key_of(Kind.CAUSE, *order)
+    return key_of(RowKind.CAUSE, *order)
 
 
 def cause_body(cause: Cause) -> bytes:
@@ -289,7 +289,7 @@ def read_order(key: Key) -> RowOrder:
 def prepared_writes(record: PreparedRecord) -> Iterator[tuple[Key, SlotRecord]]:
     """Yield the writes of a prepared lock as slots, volatile ones with their data too."""
     for write, (slot, version) in zip(record.writes, record.versions, strict=True):
-        key = key_of(Kind.PREPARED_WRITE, *record.lock, *slot)
+        key = key_of(RowKind.PREPARED_WRITE, *record.lock, *slot)
         yield key, SlotRecord(slot, version, record.stamp_ns, write.datum, "")
 
 

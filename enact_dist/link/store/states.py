@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter, OrderedDict
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from enact_dist.link.store.rows import Key, Kind, key_of
+from enact_dist.link.store.rows import Key, RowKind, key_of
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -59,9 +59,9 @@ class Outcomes:
             if ended_ns > wall_ns - OUTCOMES_KEPT_NS:
                 return
             del self._ended[session]
-            yield key_of(Kind.ENDED, session)
+            yield key_of(RowKind.ENDED, session)
             for lane in self._lanes.pop(session, ()):
-                yield key_of(Kind.OUTCOME, session, lane)
+                yield key_of(RowKind.OUTCOME, session, lane)
 
 
 class State(NamedTuple):

@@ -34,7 +34,7 @@ from enact_dist.core.protocol.messages import (
     WriteItem,
 )
 from enact_dist.errors import LinkError
-from enact_dist.link.socket.frames import MAGIC, STREAM_VERSION, Kind
+from enact_dist.link.socket.frames import MAGIC, STREAM_VERSION, FrameKind
 from enact_dist.link.zenoh.endpoints import split_endpoint
 from enact_dist.terms import Access
 from enact_dist.verify.floods.attacker import FIRST, line_of
@@ -239,7 +239,7 @@ def large_frames(attacker: Attacker) -> None:
 
 def large_socket_frames(attacker: Attacker) -> None:
     """Claims of a gigabyte, the first half of it sent."""
-    claim = MAGIC + bytes((STREAM_VERSION, Kind.MESSAGE)) + (64).to_bytes(4, "little")
+    claim = MAGIC + bytes((STREAM_VERSION, FrameKind.MESSAGE)) + (64).to_bytes(4, "little")
     claim += (1 << 30).to_bytes(8, "little") + bytes(64)
     for _ in range(4):
         with contextlib.suppress(OSError, LinkError), line_of(attacker) as line:

@@ -21,7 +21,7 @@ import zenoh
 from enact_dist.core.protocol.messages import Hello, Refused, Welcome
 from enact_dist.errors import LinkError, ProtocolError
 from enact_dist.link.memory.shared_folder import open_shared
-from enact_dist.link.socket.frames import Kind, Stream, greeting_of, send_frame, wait_at_most
+from enact_dist.link.socket.frames import FrameKind, Stream, greeting_of, send_frame, wait_at_most
 from enact_dist.link.socket.service import SOCKET_NAME
 from enact_dist.link.zenoh.config import session_config
 from enact_dist.wire.frames import decode_frame, encode_frame
@@ -239,14 +239,14 @@ class RawSocket:
 
     def _open(self, session: str) -> bool:
         try:
-            send_frame(self.connected, greeting_of(session, ACTOR), kind=Kind.OPEN)
+            send_frame(self.connected, greeting_of(session, ACTOR), kind=FrameKind.OPEN)
             kind, _, _ = self._stream.receive()
         except (OSError, EOFError, ProtocolError):
             self._tally[ENDED] += 1
             return False
-        if kind != Kind.OPENED:
+        if kind != FrameKind.OPENED:
             self._tally["connection refused"] += 1
-        return kind == Kind.OPENED
+        return kind == FrameKind.OPENED
 
     def ask(self, message: Request) -> Answer | None:
         """Send a message and return its answer; None if none came, or the connection ended."""

@@ -7,13 +7,14 @@ import sys
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.cli.text.output import print_json, shown_s
+from enact_dist.cli.text.output import print_json
 from enact_dist.cli.verbs import DONE, FAILED
 from enact_dist.errors import ConfigError
 from enact_dist.verify.simulation.scenario import Scenario
 from enact_dist.verify.simulation.schedule import WHOLE, PartOfRun, names_in
 from enact_dist.verify.simulation.series import Totals, fresh_seed, run_series
 from enact_dist.verify.simulation.shrink import Shrunk, command, shrink
+from enact_dist.world.trees import shown_s
 
 if TYPE_CHECKING:
     import argparse

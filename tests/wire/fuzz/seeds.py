@@ -19,7 +19,7 @@ from enact_dist.core.protocol.datum import Datum
 from enact_dist.core.protocol.messages import SlotVersion
 from enact_dist.core.protocol.records import Persist, SlotRecord
 from enact_dist.link.folder.mark import MARK_FILE
-from enact_dist.link.store.rows import Kind
+from enact_dist.link.store.rows import RowKind
 from enact_dist.link.store.store import open_store
 from enact_dist.terms import Durability
 from enact_dist.wire import keys
@@ -95,13 +95,13 @@ def rows(rng: random.Random) -> Iterator[bytes]:
     found = connection.execute("SELECT kind, key, body FROM record").fetchall()
     connection.close()
     shutil.rmtree(folder)
-    groups = [{Kind.PREPARED, Kind.PREPARED_WRITE}, {Kind.SLOT, Kind.CAUSE}]
+    groups = [{RowKind.PREPARED, RowKind.PREPARED_WRITE}, {RowKind.SLOT, RowKind.CAUSE}]
     for together in groups:
         yield row_input(*(one for one in found if one[0] in together))
     for one in found:
         if not any(one[0] in together for together in groups):
             yield row_input(one)
-    assert {Kind(kind) for kind, *_ in found} == set(Kind), "a kind of row without a sample"
+    assert {RowKind(kind) for kind, *_ in found} == set(RowKind), "a kind of row without a sample"
 
 
 def marks(rng: random.Random) -> Iterator[bytes]:

@@ -27,7 +27,7 @@ from enact_dist.link.folder.mark import MARK_FILE, read_mark
 from enact_dist.link.folder.wal_check import check_wal
 from enact_dist.link.store.database import DatabaseRow
 from enact_dist.link.store.recovery import put_together, read_contents
-from enact_dist.link.store.rows import Key, Kind, row_checksum
+from enact_dist.link.store.rows import Key, RowKind, row_checksum
 from enact_dist.wire import keys
 from enact_dist.wire.codecs import register_codec
 from enact_dist.wire.frames import decode_frame, encode_frame
@@ -224,7 +224,7 @@ def rows(raw: bytes) -> object:
     stored = []
     begin = 0
     while begin < len(raw) and len(stored) < ROWS_MAX:
-        kind = raw[begin] % (max(Kind) + 2)
+        kind = raw[begin] % (max(RowKind) + 2)
         middle = begin + 9 + int.from_bytes(raw[begin + 1 : begin + 5], "little")
         end = middle + int.from_bytes(raw[begin + 5 : begin + 9], "little")
         name, body = raw[begin + 9 : middle], raw[middle:end]
