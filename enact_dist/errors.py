@@ -7,7 +7,7 @@
     │  ├─ LockHeldError        a second lock in a thread, or a blocking call inside a lock
     │  ├─ LockReleasedError    a lock used outside its `with` block
     │  ├─ NotRequestedError    a datum that the lock did not ask for
-    │  ├─ ReadonlyError        a write through Read or View, or into a delivered array
+    │  ├─ ReadonlyError        a write through Read or View
     │  ├─ DatumTypeError       a datum that is not of its aspect's type
     │  ├─ UnknownWorldError    a world context that the cell does not have     .known
     │  └─ ConfigError          a cell.toml, folder or option that cannot be used   .line
@@ -24,6 +24,8 @@
        ├─ ShardUnreachableError   no answer                                    .shard .endpoint
        ├─ ProtocolError        the peer sent an unreadable message
        └─ ClockSkewError       two hosts' wall clocks are too far apart        .ahead_s
+
+A delivered array is read-only: numpy itself refuses to change it, by `ValueError`.
 """
 
 from __future__ import annotations

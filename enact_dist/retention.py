@@ -11,6 +11,7 @@ VERSIONS_MAX: Final = 100_000
 AGE_S_MAX: Final = 1e9
 """Longest age that a retention may ask for: some thirty years."""
 SIZE_BYTES_MAX: Final = 1 << 50
+"""Most bytes that a retention may ask for: 1 PiB, more than the disk of a shard has."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,6 +5,7 @@ A block that no test runs says why, `<!-- not run: reason -->`, and is counted h
 the language `console`, and files that they need, are followed in `tests/e2e/test_pages.py`.
 """
 
+import ast
 import re
 import shlex
 import subprocess
@@ -41,6 +42,28 @@ _BLOCK = re.compile(
     r" *```(?P<kind>\w*)(?: (?P<file>\S+))?\n(?P<text>.*?)^ *```$",
     re.DOTALL | re.MULTILINE,
 )
+_NAMED = re.compile(r"`(?:\.\./)*(\w+(?:[./]\w+)+)`")
+OBJECTS = {"actor", "actors", "shard", "world", "zenoh"}
+"""Folders whose names stand for an object, event or file, too: `world.view`, `shard.ready`."""
+
+
+def endings_of(path):
+    """Return the ends of a module's or a folder's path by which a text may name it."""
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ["/".join(parts[start:]) for start in range(len(parts))]
+
+
+MODULES = {
+    ending: file
+    for folder in ("enact_dist", "actors", "tests")
+    for file in (ROOT / folder).rglob("*.py")
+    for path in ((file.parent, file) if file.name == "__init__.py" else (file,))
+    for ending in endings_of(path)
+}
+"""The files of all modules, and the `__init__` of their folders, by the ends of their paths."""
+FOLDERS = {"enact_dist", "actors"} | {
+    path.name for path in (ROOT / "enact_dist").rglob("*") if path.is_dir()
+}
 
 
 class Block(NamedTuple):
@@ -177,6 +200,61 @@ def test_help_and_errors_name_pages_that_there_are():
         for named in re.findall(r"\b(?:docs|deploy)/\w+\.md", file.read_text("utf-8")):
             there = ROOT / ("enact_dist" if named.startswith("docs") else "") / named
             assert there.exists(), f"{file}: {named}"
+
+
+def docstrings_of(file):
+    """Yield the docstrings of a module, its classes and its functions."""
+    kinds = (ast.Module, ast.ClassDef, ast.FunctionDef)
+    for node in ast.walk(ast.parse(file.read_text("utf-8"))):
+        if isinstance(node, kinds):
+            yield ast.get_docstring(node) or ""
+
+
+def names_a_module(named, text):
+    """Say whether a text means a module by this: not data, an object, or a file of its reader."""
+    first, *others = re.split(r"[./]", named)
+    if named.endswith(".py"):
+        return f" {named}\n" not in text
+    mixed = "/" in named and "." in named
+    return first in FOLDERS - (OBJECTS if named.count(".") == 1 else set()) and not (
+        mixed or "docs" in others
+    )
+
+
+def lost_modules(text):
+    """Return what a text names by a path, such as `state/slots` or `link.host`, and is not there."""
+    lost = []
+    for named in _NAMED.findall(text):
+        path = named.removesuffix(".py").replace(".", "/")
+        module, _, name = path.rpartition("/")
+        found = path in MODULES or (module in MODULES and has(MODULES[module], name))
+        if names_a_module(named, text) and not found:
+            lost.append(named)
+    return lost
+
+
+def has(file, name):
+    """Say whether a module, or the `__init__` of a folder, has this name."""
+    return re.search(rf"\b{name}\b", file.read_text("utf-8")) is not None
+
+
+def test_modules_that_a_text_names_are_there():
+    """Docstrings and pages name modules by paths that lead to a file, wherever it has moved."""
+    pages = [*ALL, *sorted((ROOT / "tests").rglob("*.md"))]
+    texts = [(page, page.read_text("utf-8")) for page in pages]
+    for folder in ("enact_dist", "actors"):
+        for file in sorted((ROOT / folder).rglob("*.py")):
+            texts += [(file, text) for text in docstrings_of(file)]
+    lost = [(str(file.relative_to(ROOT)), lost_modules(text)) for file, text in texts]
+    assert [(file, names) for file, names in lost if names] == []
+
+
+def test_a_module_that_has_gone_is_found():
+    """By its path, by its dotted name and by its file; data, methods and blocks are left alone."""
+    text = "`core/multilock`, `core.state.causes.Cause`, `lock_judge.py`, `cell.toml`, `lock.end`"
+    assert lost_modules(text) == ["core/multilock", "core.state.causes.Cause", "lock_judge.py"]
+    there = "`core/state/slots`, `state.slots.Slots`, `enact_dist.Cell`, `slots.py`, `tests/sim`"
+    assert lost_modules(there) == []
 
 
 def test_readme_is_short():

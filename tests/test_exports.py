@@ -12,7 +12,7 @@ NAMES_MAX = 31
 
 
 def test_public_names_are_sorted_and_few():
-    """`__all__` is sorted (constants, classes, functions), each name exists, and there are less than 30."""
+    """`__all__` is sorted (constants, classes, functions), each name exists, and there are at most 31."""
     assert enact_dist.__all__ == sorted(
         enact_dist.__all__, key=lambda n: (not n.isupper(), not n[0].isupper(), n)
     )

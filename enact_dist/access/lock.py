@@ -1,12 +1,12 @@
-"""The lock: a set of data held at once, given back when its `with` block ends (ENACT 3.3, RAII).
+"""The lock, one per thread: data held at once until its `with` block ends (ENACT 3.3, RAII).
 
 ::
 
     with Lock(Read(online, piece, MESH), Write(online, bench, CONTACTS)) as lock: ...
 
-Clean exit publishes all writes at once; an exception publishes nothing.  One lock per thread; the
-requests may name several world contexts and shards.  Departures from the paper: the request itself
-is the index (no order-coupled list), data are immutable values, and a lock is a lease.
+Clean exit publishes all writes at once; an exception publishes nothing.  The requests may name
+several world contexts and shards.  Departures from the paper: the request itself is the index (no
+order-coupled list), data are immutable values, and a lock is a lease.
 """
 
 from __future__ import annotations

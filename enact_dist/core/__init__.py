@@ -8,9 +8,13 @@ The three laws
   3. State changes only inside `Shard.handle`, `Client` and `MultiLock`; each has
      `assert_invariants`, called after every step of a simulation.
 
-Reading order: `datum` (addresses, identities), `messages` (the protocol), `lock_table` (who waits),
-`sessions` (who is alive), `tenures` (the life of a lock), `commits` (the fence), `shard` (all of it
-behind one method), then the client's half: `beliefs`, `client`,
-`multilock`, `cuts`, `finishing`; for commits over shards `prepares` and `decisions`; and for
-contexts in time `history` (what was), `causes` (why it is so) and `worlds` (forks and drops).
+Reading order
+  * `protocol/datum` (addresses, identities) and `protocol/messages` (the protocol);
+  * the shard's half: `state/lock_table` (who waits), `state/sessions` (who is alive),
+    `state/grants` (the life of a lock), `state/commits` (the fence) and `shard/shard` (all of it
+    behind one method);
+  * the client's half: `client/lease_clock` (what may be believed), `client/client`, `client/lock`,
+    `client/cut` (views of one moment) and `client/finishing`;
+  * for commits over shards: `shard/on_prepare` and `state/decisions`;
+  * for contexts in time: `state/history` (what was) and `shard/on_world` (forks and drops).
 """

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Phase(enum.Enum):
-    """Where a lock is in its life; see the drawing in `multilock`."""
+    """Where a lock is in its life; see the drawing in `client/lock`."""
 
     ACQUIRING = "acquiring"
     VIEWING = "viewing"

@@ -25,7 +25,9 @@ E = TypeVar("E")
 
 
 WORLDS_MAX: Final = 4096
+"""World contexts of a shard.  Every `Welcome` lists all: without a bound it outgrows its frame."""
 ASPECTS_MAX: Final = 4096
+"""Aspects of a shard, bounded for the same reason."""
 FINGERPRINT_CHARACTERS_MAX: Final = 4096
 """Twice as much as `wire.fingerprint` makes of any type."""
 CATALOGUE_BYTES_MAX: Final = 3 << 20

@@ -1,8 +1,8 @@
 """The disk of one shard: written in order, synced in batches, torn by crashes.
 
-Duty of a store (core/records.py): each `Persist` whole or not at all, in order, reported when it
-survives what its durability promises.  A crash keeps any prefix that it may keep: a killed process
-loses what it had not handed to the operating system, a power cut also what was not synced.
+Duty of a store (`core/protocol/records`): each `Persist` whole or not at all, in order, reported
+when it survives what its durability promises.  A crash keeps any prefix that it may keep: a killed
+process loses what it had not handed to the operating system, a power cut also what was not synced.
 """
 
 from __future__ import annotations
