@@ -32,6 +32,7 @@ def found():
 
 
 def test_packages_stand_in_contact_where_they_shall(found):
+    """Within 3 mm, 1.5 degrees and 15 s each, a gap under 1 mm, no dent of 1 mm, no reaction."""
     packed = next(iter(found.values()))
     assert [step.reaction for each in packed for step in each.steps] == ["go_on"] * 3
     for each in packed:
@@ -43,6 +44,7 @@ def test_packages_stand_in_contact_where_they_shall(found):
 
 
 def test_their_scores_meet_the_goals(found):
+    """No goal is missed, and every verdict is a right `ok`."""
     assert not missed(scores_of(found))
     assert confusion(found).keys() == {("ok", "ok")}
 
@@ -132,6 +134,7 @@ def test_each_error_is_provoked_by_physics_seen_and_answered():
 
 
 def test_a_package_that_the_gripper_drops_is_missing_and_is_not_counted_before():
+    """Its first judgement comes after the step that dropped it, and says missing."""
     packages = draw_packages(1, seed=3, products=["meal_tray"], spread=Spread(friction=(0.4, 0.4)))
     off = [dataclasses.replace(packages[0], pick_offset_m=(0.0, -0.012))]
     knocks = {0: Knock("missing", 0.1, (0.0, 0.0))}

@@ -51,6 +51,7 @@ def boxes(slots, products):
 
 
 def test_rows_stay_on_the_tray_and_never_overlap():
+    """Forty packages of three products: boxes lie inside the tray and at most touch."""
     products = [PRODUCTS[n % 3] for n in range(40)]
     slots = planned_rows(products, SIZES)
     placed = list(boxes(slots, products))
@@ -63,6 +64,7 @@ def test_rows_stay_on_the_tray_and_never_overlap():
 
 
 def test_neighbours_of_a_row_touch_and_lie_where_the_push_goes():
+    """The first stands at the rim, each next one against it, and all are pushed along x."""
     products = ["milk_carton", "meal_tray"] * 2
     slots = planned_rows(products, SIZES)
     placed = list(boxes(slots, products))
@@ -73,6 +75,7 @@ def test_neighbours_of_a_row_touch_and_lie_where_the_push_goes():
 
 
 def test_a_cup_is_not_pushed_and_stands_in_a_row_of_its_own():
+    """The products around it share the other row."""
     slots = planned_rows(["milk_carton", "yoghurt_cup", "meal_tray"], SIZES)
     assert not slots[1].push.any()
     assert slots[0].tray_from_product[1, 3] == slots[2].tray_from_product[1, 3]
@@ -80,11 +83,13 @@ def test_a_cup_is_not_pushed_and_stands_in_a_row_of_its_own():
 
 
 def test_a_tray_takes_twelve_cartons_and_meal_trays():
+    """Of fourteen in turn, the first tray has at least twelve."""
     slots = planned_rows(["milk_carton", "meal_tray"] * 7, SIZES)
     assert [slot.tray for slot in slots].count(0) >= 12
 
 
 def test_contact_is_where_shapes_touch_not_their_boxes():
+    """A carton goes under the rim of a meal tray, so the two stand nearer than their boxes."""
     contacts = contacts_between({name: true_surface(name) for name in PRODUCTS})
     assert contacts["milk_carton", "milk_carton"] == pytest.approx(0.2, abs=0.0015)
     assert contacts["meal_tray", "meal_tray"] == pytest.approx(0.16, abs=0.0015)
@@ -95,11 +100,13 @@ def test_contact_is_where_shapes_touch_not_their_boxes():
 
 
 def test_what_no_row_takes_is_refused():
+    """The error names the size of the product and the room of a row."""
     with pytest.raises(ValueError, match=r"slab is 300 x 200 mm large; a row takes 808 x 125 mm"):
         planned_rows(["slab"], {"slab": np.array([0.3, 0.2, 0.05])})
 
 
 def test_the_arm_reaches_all_places():
+    """Pointing down, low and high above each place, its hand is off by less than 1 mm."""
     layout = CellLayout()
     slots = planned_rows(["milk_carton"] * 20 + ["yoghurt_cup"] * 20, SIZES)
     for slot in slots:
@@ -112,6 +119,7 @@ def test_the_arm_reaches_all_places():
 
 @pytest.mark.parametrize("product", PRODUCTS)
 def test_a_product_is_held_over_its_centre_of_mass_where_it_is_narrow(product):
+    """The fingers close along y, as wide as the product, at its true centre."""
     surface = true_surface(product)
     grasp = grasp_of(surface, mass_kg=0.5)
     assert abs(grasp.axis @ [0.0, 1.0, 0.0]) > 0.99
@@ -121,6 +129,7 @@ def test_a_product_is_held_over_its_centre_of_mass_where_it_is_narrow(product):
 
 
 def test_flat_faces_are_pressed_harder_than_rims():
+    """The carton takes more force than the tray and the cup, which take the same."""
     force_n = {name: grasp_of(true_surface(name), mass_kg=0.5).force_n for name in PRODUCTS}
     assert force_n["milk_carton"] > force_n["meal_tray"] == force_n["yoghurt_cup"]
 
@@ -151,11 +160,13 @@ def test_flat_faces_are_pressed_harder_than_rims():
     ],
 )
 def test_a_reaction_follows_from_what_was_seen(case, kind):
+    """Result, verdict, place and offset of a case decide what the robot does next."""
     assert react(case).kind == kind
 
 
 @pytest.mark.parametrize("kind", sorted(MOST.keys() - {"push_again", "look"}))
 def test_what_was_tried_often_enough_is_asked(kind):
+    """After its most tries the operator is asked, and the reason says how often it was tried."""
     seen = {"regrasp": "tray", "retry": "belt", "reject": "hand"}[kind]
     case = Case("place", "lost", success=False, seen=seen)
     assert react(case).kind == kind
@@ -166,6 +177,7 @@ def test_what_was_tried_often_enough_is_asked(kind):
 
 
 def test_the_worst_place_is_answered_first_wherever_it_is():
+    """A tipped package precedes moved ones; sound and excepted places are no answer."""
     verdicts = {1: "ok", 2: "moved", 3: "tipped", 4: "moved", 5: "ok"}
     assert worst(verdicts) == 3
     assert worst(verdicts, but={3}) == 2
@@ -195,6 +207,7 @@ def measured(width_m, number=4):
     ],
 )
 def test_what_the_hand_holds_is_known_by_what_it_does(grip, gripper, held):
+    """Its width under force decides; a gripper that is silent is not taken for empty."""
     assert is_held(grip, gripper, GRASP) is held
     assert not is_held(grip, gripper, None)
     assert fills(0.0, GRASP) is False
@@ -241,4 +254,5 @@ def test_the_operator_is_offered_what_can_be_done_now(verdict, seen, tried, want
 
 
 def test_what_the_robot_cannot_take_is_left_to_the_operator():
+    """Neither a retry nor a rejection is offered, nor another look."""
     assert choices_of("", "belt", can_take=False) == ("removed", "stop")

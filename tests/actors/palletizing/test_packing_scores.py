@@ -54,6 +54,7 @@ def package(*steps, **changes):
 
 
 def test_a_sound_package_meets_every_goal_that_it_is_a_case_of():
+    """A score without a case is None; every other score of a sound package meets its goal."""
     scores = scores_of({TRAY: [package()]})
     assert list(scores) == list(GOALS)
     assert not missed(scores)
@@ -90,12 +91,14 @@ KNOCKED = {"dents_mm": (9.0,), "dented_by": ("outside",)}
     ],
 )
 def test_what_is_spoilt_misses_its_goal(spoilt, name, value):
+    """One fault of one package shows in the score of this fault, which then misses its goal."""
     scores = scores_of({TRAY: [spoilt]})
     assert scores[name] == pytest.approx(value)
     assert name in missed(scores)
 
 
 def test_what_the_operator_touched_is_no_sound_placement_but_counts_as_damaged():
+    """Its position does not count, its dents and the operator's hand do."""
     scores = scores_of({TRAY: [package(along_mm=9.0, by_hand=True, **DENTED), package()]})
     assert scores["shift_p95_mm"] == 1.0
     assert scores["by_hand_share"] == 0.5
@@ -103,12 +106,14 @@ def test_what_the_operator_touched_is_no_sound_placement_but_counts_as_damaged()
 
 
 def test_damage_that_was_provoked_is_not_that_of_the_robot():
+    """Dents by a knock do not count; those on a rough tray count as damaged, not as gentle."""
     assert scores_of({TRAY: [package(**KNOCKED)]})["damaged_gentle"] == 0
     rough = scores_of({ROUGH: [package(**DENTED)]})
     assert (rough["damaged_gentle"], rough["damaged"]) == (None, 1)
 
 
 def test_provoked_trays_count_for_verdicts_and_recoveries_only():
+    """Their positions and cycle times leave the scores of the other trays as they are."""
     spoilt = package(
         step("regrasp", "moved", "moved"),
         judgements=[judged("moved", "ok")],
@@ -122,6 +127,7 @@ def test_provoked_trays_count_for_verdicts_and_recoveries_only():
 
 
 def test_a_retry_whose_package_was_knocked_is_no_failed_recovery():
+    """The same retry without a knock is one, and worsened the package."""
     knocked = dataclasses.replace(step("retry", "belt", "tipped"), stages=(("place", "placed"),))
     blocked = step("pack", "belt", "belt", result="blocked", works=False)
     scores = scores_of({PROVOKED: [package(blocked, knocked, knock="tipped")]})
@@ -157,6 +163,7 @@ def test_a_dent_that_was_there_before_makes_nothing_worse():
 
 
 def test_a_failure_that_the_net_noticed_is_counted():
+    """A blocked step that its net reported, answered by a retry, counts once."""
     failed = step("pack", "belt", "belt", result="blocked", works=False)
     assert scores_of({TRAY: [package(failed, step("retry"))]})["noticed_by_net"] == 1
 
@@ -203,6 +210,7 @@ def test_a_slight_dent_in_the_demo_may_be_flagged_or_not(depth_mm, truth, right)
 
 
 def test_the_table_sets_truth_against_verdict():
+    """Judgements are counted by pair, and printed with one row per truth that occurs."""
     found = {TRAY: [package(judgements=[judged(), judged("moved", "extra")])]}
     assert confusion(found) == {("ok", "ok"): 1, ("moved", "extra"): 1}
     head, ok, moved = (line.split() for line in confusion_text(confusion(found)).splitlines())
@@ -212,12 +220,14 @@ def test_the_table_sets_truth_against_verdict():
 
 
 def test_states_have_an_order():
+    """From sound over moved and bin to tipped; what stands beside is as bad as what is deformed."""
     states = ("ok", "moved", "bin", "tipped")
     assert sorted(states, key=badness) == list(states)
     assert badness("beside") == badness("deformed") > badness("bin")
 
 
 def test_records_go_through_json():
+    """A package is the same after a line of JSON, a pose error that is no number included."""
     whole = package(judgements=[judged(pose_mm=math.nan)], **DENTED)
     [back] = packed_of(line_of([whole]))
     assert dataclasses.astuple(back)[:5] == dataclasses.astuple(whole)[:5]
@@ -226,6 +236,7 @@ def test_records_go_through_json():
 
 
 def test_an_interrupted_run_goes_on_with_the_trays_that_are_left(monkeypatch, tmp_path):
+    """Noted trays are not packed again, except one whose line was cut off."""
     trays = trays_of(48, provoke=("moved",))
     packed = []
 
@@ -256,6 +267,7 @@ def test_an_interrupted_run_goes_on_with_the_trays_that_are_left(monkeypatch, tm
 
 
 def test_trays_take_the_settings_in_turn_and_held_out_seeds():
+    """Forty packages make trays of 12, 12, 12 and 4, each with its own setting and seed."""
     trays = trays_of(40, seed=2)
     assert [tray.seed for tray in trays] == [2000, 2001, 2002, 2003]
     assert [tray.count for tray in trays] == [12, 12, 12, 4]
@@ -263,6 +275,7 @@ def test_trays_take_the_settings_in_turn_and_held_out_seeds():
 
 
 def test_errors_are_provoked_with_every_setting_alike():
+    """Each of the nine settings has one provoked tray."""
     trays = trays_of(12 * 9 * EVERY, provoke=("moved",))
     provoked = [(tray.sigma_mm, tray.friction) for tray in trays if tray.provoked]
     assert len(provoked) == len(set(provoked)) == 9
@@ -272,6 +285,7 @@ def test_errors_are_provoked_with_every_setting_alike():
     "spread", ["much", "2", "2,0.4,1", "nan,0.4", "2,nan", "inf,0.4", "2,inf", "-1,0.4", "2,0"]
 )
 def test_the_bench_refuses_what_is_no_spread(spread, capsys):
+    """A usage error quotes what was given and shows a spread that would do."""
     with pytest.raises(SystemExit):
         main(["bench", "palletizing", f"--spread={spread}"])
     last = capsys.readouterr().err.splitlines()[-1]
@@ -279,6 +293,7 @@ def test_the_bench_refuses_what_is_no_spread(spread, capsys):
 
 
 def test_the_bench_refuses_an_error_that_cannot_be_provoked(capsys):
+    """A usage error quotes it and lists those that can be provoked."""
     with pytest.raises(SystemExit):
         main(["bench", "palletizing", "--provoke", "moved,burnt"])
     last = capsys.readouterr().err.splitlines()[-1]
@@ -286,5 +301,6 @@ def test_the_bench_refuses_an_error_that_cannot_be_provoked(capsys):
 
 
 def test_the_bench_names_the_errors_of_the_simulation():
+    """The errors that the option takes are those that the simulation provokes."""
     knocks = pytest.importorskip("actors.palletizing.simulation.knocks", exc_type=ImportError)
     assert bench.PROVOKED == knocks.KNOCKS

@@ -23,6 +23,7 @@ def rows_of(asked):
 
 
 def test_packing_gives_a_row_per_score_and_per_cell_of_the_table(monkeypatch, tmp_path):
+    """A score without a case has no value, and one without a goal has none to meet."""
     asked = PackingOptions(60, 7, 1, provoke=("moved",), out=tmp_path / "scores")
     played = []
 
@@ -53,6 +54,7 @@ def test_packing_gives_a_row_per_score_and_per_cell_of_the_table(monkeypatch, tm
     ],
 )
 def test_options_that_would_do_nothing_are_refused(asked, why):
+    """Provoking needs enough packages, and packing rather than perception alone."""
     with pytest.raises(MisuseError, match=why):
         rows_of(asked)
 
@@ -71,6 +73,7 @@ def test_perception_is_scored_on_faces_noise_light_and_contact():
 
 
 def test_perception_alone_gives_rows_for_each_series(monkeypatch):
+    """Right verdicts, false alarms, poses and pairs of truth and verdict, under its name."""
     (series,) = (s for s in perception_scores.series_of(8, 7001) if s.name == "mixed")
     sound = [Scored("milk_carton", "ok", 0.0, "ok", mm / 10, 0.1) for mm in range(8)]
     missed = Scored("milk_carton", "missing", 0.0, "ok", 0.0, 0.1)

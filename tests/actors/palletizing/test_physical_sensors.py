@@ -107,6 +107,7 @@ def test_empty_image_has_no_package(cell):
 
 
 def test_image_is_that_of_all_meshes_at_once_and_only_what_has_moved_is_drawn_again(cell):
+    """At rest nothing is drawn; a package that moves by 1 mm is drawn once."""
     sensor = PhysicalTraySensor(cell.shown, seed=1)
     shown = cell.shown()
     meshes = [*still_meshes(cell.layout), *arm_meshes(shown)]

@@ -58,6 +58,7 @@ def test_a_picture_is_kept_once_per_place_and_only_of_a_board_at_rest(tmp_path):
 
 
 def test_sources_that_cannot_be_opened_are_one_line(tmp_path):
+    """An address without a size, and a device that is not there, are named."""
     with (
         pytest.raises(CameraError, match=r"found none; write v4l2:/dev/video0\?size=640x480"),
         opened_sources(["v4l2:/dev/video0"]),

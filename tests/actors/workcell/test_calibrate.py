@@ -114,6 +114,7 @@ def test_lenses_that_are_known_are_kept(copied, tmp_path):
 
 
 def test_a_camera_that_saw_the_board_alone_is_left_out_and_named(copied):
+    """The others are calibrated, and the message says which pictures to take."""
     for file in (copied / "images" / "2").iterdir():
         file.rename(file.with_name(f"alone-{file.name}"))
 
@@ -128,6 +129,7 @@ def test_a_camera_that_saw_the_board_alone_is_left_out_and_named(copied):
 
 
 def test_an_older_file_is_kept_beside(copied):
+    """What was there is kept as `cameras.json.before`."""
     (copied / "cameras.json").write_text("by hand")
 
     calibrate(copied, options(copied))
@@ -164,6 +166,7 @@ def test_rows_that_were_never_seen_are_told(copied):
 
 
 def test_pictures_that_are_too_much_alike_are_refused(copied):
+    """Copies of one picture lead to the advice to tilt the board."""
     for camera in "012":
         folder = copied / "images" / camera
         first = (folder / "000.png").read_bytes()
@@ -174,6 +177,7 @@ def test_pictures_that_are_too_much_alike_are_refused(copied):
 
 
 def test_wrong_pictures_are_one_line_each(copied, tmp_path):
+    """Absent, empty, of another size, no picture, a wrong origin: each is named."""
     assert "no such folder" in refusal(tmp_path / "absent")
     (tmp_path / "empty").mkdir()
     assert "no folder images" in refusal(tmp_path / "empty")
@@ -204,6 +208,7 @@ def test_wrong_pictures_are_one_line_each(copied, tmp_path):
     ],
 )
 def test_boards_that_there_are_not(text, said):
+    """A wrong layout, size, unit or dictionary is named, with what was asked."""
     with pytest.raises(ValueError, match="asked for a board") as caught:
         board_of(text)
     assert said in str(caught.value)
@@ -237,6 +242,7 @@ def test_a_printed_board_is_found_where_its_rectangles_are(text):
 
 
 def test_all_kinds_of_sheets_have_the_same_rectangles():
+    """SVG and PDF draw as many, in the size of the board; the PDF's table is right."""
     board = board_of("7x5,0.08,0.06,4X4_50")
     count = len(list(rectangles(board)))
 

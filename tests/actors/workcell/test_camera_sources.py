@@ -41,6 +41,7 @@ def refusal(address, camera="0"):
 
 
 def test_folder_plays_its_images_in_order_and_again(tmp_path):
+    """One image per tick, by the number of the tick; after the last comes the first."""
     pictures(tmp_path / "3")
     source = opened(f"folder:{tmp_path}/{{camera}}", "3")
     levels = [source.frame(tick * PERIOD_NS)[0, 0, 0] for tick in range(30, 36)]
@@ -49,6 +50,7 @@ def test_folder_plays_its_images_in_order_and_again(tmp_path):
 
 
 def test_folder_with_a_begin_ends(tmp_path):
+    """With a begin each image plays once, and then an error says that all were played."""
     pictures(tmp_path)
     source = opened(f"folder:{tmp_path}?begin={50 * PERIOD_NS}")
     assert source.frame(52 * PERIOD_NS)[0, 0, 0] == 20
@@ -57,6 +59,7 @@ def test_folder_with_a_begin_ends(tmp_path):
 
 
 def test_folders_that_cannot_be_played_are_one_line_each(tmp_path):
+    """Absent, empty, a file, another size, a gap, a damaged image: each is named."""
     assert "no such folder" in refusal(f"folder:{tmp_path / 'absent'}")
     (tmp_path / "empty").mkdir()
     assert "found no file that ends in" in refusal(f"folder:{tmp_path / 'empty'}")
@@ -73,6 +76,7 @@ def test_folders_that_cannot_be_played_are_one_line_each(tmp_path):
 
 
 def test_frame_that_has_gone_is_named(tmp_path):
+    """An image that was deleted after the source was opened is an error with its name."""
     source = opened(f"folder:{pictures(tmp_path)}")
     (tmp_path / "000001.png").unlink()
     with pytest.raises(CameraError, match=r"000001\.png: .*no such file any more"):
@@ -94,10 +98,12 @@ def test_frame_that_has_gone_is_named(tmp_path):
     ],
 )
 def test_addresses_that_lead_nowhere(address, said):
+    """A wrong kind, option, device or recording is one line that says what was found."""
     assert said in refusal(address)
 
 
 def test_simulated_cameras_are_numbered():
+    """A name that is no number is refused."""
     assert "asked for a simulated camera" in refusal("live", "left")
 
 
@@ -113,6 +119,7 @@ def video(tmp_path):
 
 
 def test_video_gives_an_image_per_tick_and_ends(video):
+    """Three images of a file come in order; the next frame is the end, by name."""
     source = opened(f"v4l2:{video}?size=64x48&fps=10")
     levels = [int(source.frame(PERIOD_NS)[20, 20, 0]) for _ in range(3)]
     assert levels == pytest.approx([40, 100, 160], abs=6)
@@ -122,6 +129,7 @@ def test_video_gives_an_image_per_tick_and_ends(video):
 
 
 def test_video_of_another_size(video):
+    """A file whose images are not of the calibrated size is refused at its first frame."""
     source = source_of(f"v4l2:{video}", "0")
     source.open(cameras(0.2)[0])
     with pytest.raises(CameraError, match="asked for 128 x 96 pixels"):
@@ -152,6 +160,7 @@ class Device:
 
 
 def test_driver_that_hangs_is_named_and_comes_back():
+    """A frame times out, also the next one; once the driver answers, images come again."""
     device = Device()
     capture = Capture(device, "camera/2")
     with pytest.raises(CameraError, match=r"camera/2: .*no answer within 0\.05 s"):
@@ -197,6 +206,7 @@ def test_camera_that_waits_for_its_calibration_says_so_once(caplog):
 
 
 def test_camera_publishes_the_image_of_its_tick():
+    """An image without a time of exposure bears the stamp of its tick."""
     device = Device()
     device.free.set()
     with testing.worlds("online") as cell:
@@ -211,6 +221,7 @@ def test_camera_publishes_the_image_of_its_tick():
 
 
 def test_camera_stamps_an_image_with_its_exposure():
+    """A time of exposure that the source gives is the stamp of the datum."""
     device = Device()
     device.free.set()
     device.exposed_ns = 999_990_000_000
@@ -224,6 +235,7 @@ def test_camera_stamps_an_image_with_its_exposure():
 
 
 def test_camera_that_fails_writes_nothing_and_opens_its_source_again():
+    """No image is written after an error, and the next run opens the source a second time."""
     device = Device()
     device.free.set()
     with testing.worlds("online") as cell:

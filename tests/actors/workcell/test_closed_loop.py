@@ -96,6 +96,7 @@ def test_who_vanishes_behind_the_cabinet_between_two_sets_is_in_the_second_one()
 
 
 def test_a_box_is_filled_by_capsules_within_it():
+    """At least 27 balls, and none of them reaches out of the box."""
     box = Box("thing", (1.0, 0.0, 0.15), (0.15, 0.15, 0.15))
     balls = capsules_in(box)
     assert (np.abs(balls[:, :3] - box.centre_m) + balls[:, 6:] <= 0.15 + 1e-9).all()

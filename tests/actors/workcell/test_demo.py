@@ -207,6 +207,7 @@ def test_a_camera_repeats_its_image_until_its_time_is_over(tmp_path, monkeypatch
 
 
 def test_an_actor_that_reads_no_commands_ends_the_run_in_one_line(tmp_path):
+    """The error names the actor and the log to look at."""
     with local(worlds=["online", "truth"]) as cell:
         running = DemoCell(tmp_path / "cell.toml", log="a log")
         conductor = Conductor(cell, running, Options(tmp_path), lambda _: None)
@@ -289,6 +290,7 @@ def test_updates_without_sharing_do_what_they_do_in_a_cell():
     ],
 )
 def test_options_that_cannot_work_are_one_line_each(tmp_path, given, said):
+    """The error names the option, and what was given."""
     with pytest.raises(ConfigError, match=re.escape(said)):
         Options(**{"out": tmp_path, **given})
 
@@ -303,6 +305,7 @@ def test_report_names_what_was_missed():
 
 
 def test_a_state_without_a_reason_is_one_word():
+    """What is reported after the colon is the reason, without its semicolon."""
     assert told(words.Safety("run", "", 0), None, 0) == ("run", "run")
     without = words.Safety("run", "; without camera/3", 0)
     assert told(without, None, 0) == ("run", "run: without camera/3")

@@ -47,6 +47,7 @@ def test_the_workspace_is_where_the_grid_is() -> None:
 
 
 def test_the_truth_scores_perfectly(perfect: dict[str, float]) -> None:
+    """A run that reports the truth loses no voxel, misses no set and breaks no distance."""
     assert perfect["lost_near_voxels"] == perfect["lost_share"] == 0.0
     assert perfect["true_voxels"] > 500
     assert perfect["iou_p50"] == 1.0
@@ -57,6 +58,7 @@ def test_the_truth_scores_perfectly(perfect: dict[str, float]) -> None:
 
 
 def test_latencies_are_from_the_exposure(perfect: dict[str, float]) -> None:
+    """Hull after 40 ms and robot after 55 ms, as the run was made."""
     assert perfect["hull_p50_ms"] == pytest.approx(40.0)
     assert perfect["robot_p99_ms"] == pytest.approx(55.0)
 
@@ -77,6 +79,7 @@ def test_a_set_that_never_reached_the_robot_waits_for_the_next_one() -> None:
 
 
 def test_lost_voxels_and_missed_sets_are_counted() -> None:
+    """One set left out and three voxels taken away show as exactly that."""
     run = Run("S2", 4.0)
     run.rest()
     for tick in run.ticks:
@@ -92,6 +95,7 @@ def test_lost_voxels_and_missed_sets_are_counted() -> None:
 
 
 def test_an_arm_that_is_too_fast_near_a_person_is_a_violation() -> None:
+    """The same arm at rest beside the same person is none."""
     violations = []
     for dq in (1.0, 0.0):
         run = Run("S3", 8.0)  # a person reaches over the table
@@ -116,6 +120,7 @@ def test_a_robot_without_commands_counts_as_at_rest() -> None:
 
 
 def test_productivity_is_set_beside_an_oracle_and_a_zone() -> None:
+    """The zone does less than the oracle."""
     run = Run("S2", 6.0)
     run.rest()
     for tick in run.ticks:
@@ -130,6 +135,7 @@ def test_productivity_is_set_beside_an_oracle_and_a_zone() -> None:
 
 
 def test_tracks_are_compared_with_the_nearest_person() -> None:
+    """A track 3 cm beside the truth scores 3 cm, with the true velocity and prediction."""
     run = Run("S3", 5.0)
     run.rest()
     person = Person(run.scenario.walks[0])
@@ -229,6 +235,7 @@ def velocity_of(person: Person, tick: int) -> np.ndarray:
 
 
 def test_a_path_through_the_hull_is_named() -> None:
+    """Of two paths, the one whose hull holds the arm counts as touching."""
     run = Run("S1", 1.0)
     run.rest()
     for tick in run.ticks:
@@ -251,6 +258,7 @@ def test_a_path_through_the_hull_is_named() -> None:
 
 
 def test_states_along_a_path_are_close_and_keep_its_corners() -> None:
+    """No joint moves more than the step, and each corner is a state."""
     corner = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 0.5]])
     states = along(corner, step_rad=0.1)
     assert np.abs(np.diff(states, axis=0)).max() <= 0.1 + 1e-12
@@ -258,6 +266,7 @@ def test_states_along_a_path_are_close_and_keep_its_corners() -> None:
 
 
 def test_a_recording_without_truth_is_refused() -> None:
+    """The error names the datum that is missing."""
     run = Run("S1", 1.0)
     del run.versions["truth", "scenario", "playing"]
     with pytest.raises(ConfigError, match="no truth scenario/playing"):
@@ -265,6 +274,7 @@ def test_a_recording_without_truth_is_refused() -> None:
 
 
 def test_every_goal_says_what_it_is_of() -> None:
+    """Each goal has a text, tells met from missed, and prints its bound."""
     assert all(goal.what for goal in GOALS.values())
     assert GOALS["sets_missed"].met(0.0)
     assert not GOALS["sets_missed"].met(1.0)

@@ -65,6 +65,7 @@ def test_elbow_out_of_the_plane():
 
 
 def test_zero_of_a_joint_is_added_to_its_angle():
+    """An arm with offset zeros, driven by so much less, has the same poses."""
     arm = planar()
     offset = Arm(arm.dh + np.array([0, 0, 0, 0.4]), arm.base, arm.capsules)
     q = np.array([[0.2, -0.7]])
@@ -72,6 +73,7 @@ def test_zero_of_a_joint_is_added_to_its_angle():
 
 
 def test_a_batch_is_its_states_one_by_one():
+    """Five states at once give the capsules of each alone."""
     arm, q = twisted(), np.random.default_rng(1).uniform(-2, 2, (5, 7))
     batch = capsules_at(arm, q)
     assert batch.shape == (5, 7, 7)
@@ -80,6 +82,7 @@ def test_a_batch_is_its_states_one_by_one():
 
 
 def test_poses_stay_rigid():
+    """Rotations are orthogonal with determinant one, over random states."""
     turns = link_poses(twisted(), np.random.default_rng(2).uniform(-3, 3, (20, 7)))[..., :3, :3]
     gram = turns @ turns.swapaxes(-1, -2)
     np.testing.assert_allclose(gram, np.broadcast_to(np.eye(3), gram.shape), atol=1e-12)
@@ -87,6 +90,7 @@ def test_poses_stay_rigid():
 
 
 def test_velocities_of_ends_are_what_differences_say():
+    """The velocities of the ends agree with central differences."""
     arm, draw = twisted(), np.random.default_rng(4)
     q, dq, step = draw.uniform(-2, 2, (6, 7)), draw.uniform(-1, 1, (6, 7)), 1e-6
     moved = capsules_at(arm, q + step * dq) - capsules_at(arm, q - step * dq)
@@ -95,6 +99,7 @@ def test_velocities_of_ends_are_what_differences_say():
 
 
 def test_jacobian_maps_joint_speeds_to_the_tool():
+    """Its linear part is the tip's velocity, its angular part a difference of turns."""
     arm, draw = twisted(), np.random.default_rng(5)
     q, dq, step = draw.uniform(-2, 2, (4, 7)), draw.uniform(-1, 1, (4, 7)), 1e-6
     twist = (jacobians(arm, q) @ dq[..., None])[..., 0]
@@ -106,6 +111,7 @@ def test_jacobian_maps_joint_speeds_to_the_tool():
 
 
 def test_tool_is_the_last_end():
+    """The tool's position is the far end of the last capsule."""
     arm, q = twisted(), np.full(7, 0.3)
     tool = tool_poses(arm, q)[0, :3, 3]
     assert tool == pytest.approx(capsules_at(arm, q)[0, -1, 3:6], abs=1e-12)

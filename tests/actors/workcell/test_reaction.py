@@ -31,10 +31,12 @@ def flags(*ones):
     ],
 )
 def test_an_effect_counts_from_its_own_begin(effect, found):
+    """It may begin before its cause; one that is over before, or comes after it, is none."""
     assert after_ms(STAMPS, flags(3, 4, 5, 6, 7), STAMPS, effect) == found
 
 
 def test_two_causes_have_two_effects():
+    """Each is paired with the effect within its own span."""
     assert after_ms(STAMPS, flags(1, 2, 5, 6, 7), STAMPS, flags(2, 6)) == [10.0, 10.0]
 
 
@@ -79,6 +81,7 @@ def test_a_leg_ends_when_its_last_path_has_been_followed():
 
 
 def test_what_if_tells_what_is_saved_and_what_must_hold():
+    """Only legs of both runs count; a stranger, or no path in the fork, fails a check."""
     found = WhatIf(2, 3, (2.0, 1.0), (2.5, 1.5, 4.0), strangers=0)
     assert found.saved_s == pytest.approx(1.0)  # the third leg is online only
     assert all(found.checks().values())

@@ -45,12 +45,14 @@ def test_bent_elbow_brings_the_tool_down():
 
 
 def test_home_is_within_the_limits_and_above_the_table():
+    """The tip of the tool is more than 85 cm up."""
     assert (np.abs(HOME_RAD) < ARM.q_max).all()
     assert capsules_at(ARM, np.array(HOME_RAD))[0, -1, 5] > 0.85
 
 
 @pytest.mark.parametrize("height_m", [1.6, 1.75, 1.9])
 def test_lower_foot_stands_on_the_floor_and_the_head_at_the_height(height_m):
+    """At every phase of a step the lowest point is at zero."""
     for phase in np.linspace(0.0, 2.0 * np.pi, 25):
         capsules = body(Posture(0.3, -0.2, 1.0, phase_rad=phase, swing=1.0), height_m)
         assert capsules.shape == (CAPSULES, 7)
@@ -60,6 +62,8 @@ def test_lower_foot_stands_on_the_floor_and_the_head_at_the_height(height_m):
 
 
 def test_limbs_keep_their_lengths_while_walking():
+    """No capsule becomes longer or shorter over a step."""
+
     def lengths(phase):
         capsules = body(Posture(0.0, 0.0, 0.0, phase_rad=phase, swing=1.0))
         return np.linalg.norm(capsules[:, 3:6] - capsules[:, :3], axis=1)
@@ -69,6 +73,7 @@ def test_limbs_keep_their_lengths_while_walking():
 
 
 def test_body_turns_and_moves_as_a_whole():
+    """A posture elsewhere is the same one, turned and shifted."""
     posture = Posture(0.0, 0.0, 0.0, phase_rad=0.7, swing=0.8)
     here, there = body(posture), body(Posture(2.0, -1.0, math.pi / 2, phase_rad=0.7, swing=0.8))
     np.testing.assert_allclose(there[:, 0], 2.0 - here[:, 1], atol=1e-12)
@@ -78,6 +83,7 @@ def test_body_turns_and_moves_as_a_whole():
 
 @pytest.mark.parametrize("target_m", [(0.5, -0.3, 1.1), (0.45, 0.1, 1.4), (0.3, -0.4, 0.8)])
 def test_hand_reaches_what_is_near_enough(target_m):
+    """The right hand is at its target, and limbs keep the lengths they have at rest."""
     capsules = body(Posture(0.0, 0.0, 0.0, target_m=target_m, reach=1.0))
     np.testing.assert_allclose(capsules[RIGHT_HAND, 3:6], target_m, atol=1e-6)
     lengths = np.linalg.norm(capsules[:, 3:6] - capsules[:, :3], axis=1)
@@ -87,6 +93,7 @@ def test_hand_reaches_what_is_near_enough(target_m):
 
 
 def test_hand_points_at_what_is_too_far():
+    """The arm is stretched towards the target, as long as it is."""
     capsules = body(Posture(0.0, 0.0, 0.0, target_m=(3.0, -0.24, 1.4), reach=1.0))
     shoulder, tip = capsules[RIGHT_HAND - 2, :3], capsules[RIGHT_HAND, 3:6]
     way, wanted = tip - shoulder, np.array([3.0, -0.24, 1.4]) - shoulder
@@ -104,6 +111,7 @@ def test_arm_that_begins_to_reach_hangs_where_it_hung():
 
 
 def test_person_stands_turns_and_reaches_where_the_walk_says():
+    """Absent before and after its walk; at the pause the hand is at its target."""
     pause = Pause(1, 8.0, reach_m=(0.75, -0.25, 1.0), lean_rad=0.25, facing_rad=np.pi)
     walk = Walk(((2.9, -0.9), (1.35, -0.3), (2.9, -0.9)), begin_s=2.0, pauses=(pause,))
     person = Person(walk)

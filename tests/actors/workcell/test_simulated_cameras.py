@@ -79,6 +79,7 @@ def recording(tmp_path_factory):
 
 
 def test_live_view_is_the_same_for_the_same_stamp_and_has_the_arm_where_its_joints_are():
+    """Equal inputs give equal images; other joints, or no robot, change over 100 pixels."""
     away = np.add(HOME_RAD, [1.2, 0, 0, 0, 0, 0, 0])
     one, same, other, bare = (
         opened("live", what, joints).frame(BEGIN_NS + 20 * PERIOD_NS)
@@ -95,6 +96,7 @@ def test_live_view_is_the_same_for_the_same_stamp_and_has_the_arm_where_its_join
 
 
 def test_prepared_view_is_the_view():
+    """Preparing a stamp beforehand changes no pixel of its image."""
     ready, unready = (opened("live", playing(), joints_of(HOME_RAD)) for _ in range(2))
     stamp_ns = BEGIN_NS + 25 * PERIOD_NS
     ready.prepare(stamp_ns)
@@ -102,6 +104,7 @@ def test_prepared_view_is_the_view():
 
 
 def test_nobody_is_there_before_and_after():
+    """Before the scenario the image is that of the empty room, after it but for noise."""
     source = opened("live", playing(robot=False))
     empty = opened("live", None).frame(BEGIN_NS - PERIOD_NS)
     np.testing.assert_array_equal(source.frame(BEGIN_NS - PERIOD_NS), empty)
@@ -113,12 +116,14 @@ def test_nobody_is_there_before_and_after():
 
 
 def test_scenario_must_begin_at_a_tick():
+    """A begin one nanosecond after a tick is refused."""
     late = dataclasses.replace(playing(), start_ns=BEGIN_NS + 1)
     with pytest.raises(CameraError, match="asked for a scenario that begins at a tick"):
         opened("live", late).frame(BEGIN_NS)
 
 
 def test_without_numba_a_simulated_camera_says_what_to_install(monkeypatch):
+    """The error names the camera and the extra."""
     monkeypatch.setitem(sys.modules, "actors.workcell.simulation.kernels", None)
     with pytest.raises(CameraError, match=r"camera/0: .*install the extra workcell"):
         opened("live", None)
@@ -144,6 +149,7 @@ def test_scenario_that_begins_at_another_time_is_compared_only_once(recording, m
 
 
 def test_stuck_camera_repeats_its_image():
+    """Its image stays the same while it is stuck, and changes afterwards."""
     source = opened("live", playing(), joints_of(HOME_RAD))
     first = source.frame(BEGIN_NS)
     source.look(playing(), joints_of(HOME_RAD), stuck=True)
@@ -154,6 +160,7 @@ def test_stuck_camera_repeats_its_image():
 
 @pytest.mark.parametrize("frame", [0, 15, 30])
 def test_played_view_with_the_live_arm_is_the_live_view_but_for_noise_and_jpeg(recording, frame):
+    """Blurred, the two differ by less than 0.3 levels on average."""
     stamp_ns, joints = BEGIN_NS + frame * PERIOD_NS, joints_of(HOME_RAD)
     live = opened("live", playing(), joints).frame(stamp_ns)
     played = opened(f"playback+robot:{recording[1]}", playing(), joints).frame(stamp_ns)
@@ -163,6 +170,7 @@ def test_played_view_with_the_live_arm_is_the_live_view_but_for_noise_and_jpeg(r
 
 
 def test_recording_is_made_once_and_again_if_it_is_of_something_else(recording):
+    """A second request for the same scenario returns the folder untouched."""
     root, folder = recording
     made_ns = (folder / "recording.json").stat().st_mtime_ns
     scenario = scenario_of("visit", 3, SECONDS)
@@ -228,6 +236,7 @@ def test_options_refuse_a_recording_that_lacks_a_camera(recording, tmp_path):
 
 
 def test_recording_knows_its_truth(recording):
+    """It has the bodies of its scenario, and no joints if it was made without the arm."""
     truth = np.load(recording[1] / "truth.npz")
     stage = Stage(scenario_of("visit", 3, SECONDS))
     np.testing.assert_array_equal(truth["bodies"][30, 0], stage.bodies_at(3.0)[0])
@@ -272,6 +281,7 @@ def test_a_scenario_that_begins_anew_is_not_compared_again(recording, monkeypatc
 
 
 def test_recording_with_the_arm_plays_as_it_was(tmp_path):
+    """Its arm is where the motion put it; no second arm can be drawn over it."""
     scenario = scenario_of("S1", 1, 0.3)
 
     def motion(at_s):
@@ -287,6 +297,7 @@ def test_recording_with_the_arm_plays_as_it_was(tmp_path):
 
 
 def test_recordings_that_do_not_fit_are_one_line_each(recording, tmp_path):
+    """Another seed, size, camera, format or a missing image is named."""
     address = f"playback+robot:{recording[1]}"
     with pytest.raises(CameraError, match="asked for a recording of visit, seed 4"):
         opened(address, playing(seed=4)).frame(BEGIN_NS)
@@ -329,6 +340,7 @@ def test_mujoco_draws_the_same_scene_or_says_why_not():
 
 
 def test_arm_is_shown_between_its_samples_and_ahead_of_them():
+    """It goes on at its last speed, and hardly moves on if it was braking."""
     speed = np.array([1.0, 0, 0, 0, 0, 0, -0.5])
     joints = joints_of(HOME_RAD, speed)
     np.testing.assert_allclose(
@@ -343,6 +355,7 @@ def test_arm_is_shown_between_its_samples_and_ahead_of_them():
 
 
 def test_simulated_camera_and_truth_write_what_plays():
+    """Image, joints and bodies are written; the body of a person who has left goes."""
     with testing.worlds("online", "truth") as cell:
         online, truth = cell.world("online"), cell.world("truth")
         start_ns = 1_000 * 1_000_000_000 - 3 * 1_000_000_000

@@ -87,6 +87,7 @@ def test_a_capsule_seen_along_its_axis_shows_its_nearer_end(ends):
 
 
 def test_capsules_of_arm_and_person_fill_their_outlines():
+    """Nothing is drawn outside the outlines, and almost nothing is left open inside."""
     scene = Stage(scenario_of("visit", 1)).scene_at(6.0, capsules_at(ARM, np.array(HOME_RAD))[0])
     camera = view(3).calibration
     drawn = view(3).render(scene.capsules, scene.colours, ())
@@ -103,6 +104,7 @@ def test_capsules_of_arm_and_person_fill_their_outlines():
 
 @pytest.mark.parametrize("number", [1, 6])
 def test_distorted_lens_shows_things_where_opencv_projects_them(number):
+    """Small balls lie within 0.35 pixels of their projection."""
     one, camera = view(number, LENS), view(number, LENS).calibration
     for centre in ((1.3, 0.9, 1.4), (-0.5, 0.2, 1.9), (0.0, -1.6, 0.5)):
         names = one.render(sphere(*centre, 0.06), grey(1), ()).names
@@ -111,6 +113,7 @@ def test_distorted_lens_shows_things_where_opencv_projects_them(number):
 
 
 def test_nearer_things_hide_what_is_behind_in_any_order():
+    """Of two balls on one ray the nearer one shows, whichever is given first."""
     camera = view(0).calibration
     eye = -camera.camera_from_cell[:3, :3].T @ camera.camera_from_cell[:3, 3]
     toward = np.array([0.0, 0.0, 0.7]) - eye
@@ -131,6 +134,7 @@ def test_boxes_hide_what_is_behind_them():
 
 
 def test_floor_and_table_have_the_depth_of_their_planes():
+    """Three points of table and floor are as deep as the planes that they lie in."""
     camera, depth = view(4).calibration, view(4).backdrop().depth_m
     for point in ((1.0, 0.2, 0.75), (0.9, -1.0, 0.0), (0.8, 1.0, 0.0)):
         column, row = np.rint(pixel(camera, point)).astype(int)
@@ -168,6 +172,7 @@ def test_two_views_agree_on_where_surfaces_are():
 
 
 def test_shadow_falls_behind_a_thing_as_the_lamp_sees_it():
+    """Where the ray from lamp through ball lands, the image darkens by its light factor."""
     one, ball = view(4), np.array([0.0, -0.4, 1.75])
     landed = np.array(LAMP_M) + (ball - LAMP_M) * LAMP_M[2] / (LAMP_M[2] - ball[2])
     lit, drawn = one.backdrop().image, one.render(sphere(*ball, 0.2), grey(1))
@@ -199,12 +204,14 @@ def test_drawing_in_two_steps_is_drawing_at_once():
 
 
 def test_nothing_moves_nothing_changes():
+    """Without capsules the image is the backdrop and no pixel has a name."""
     drawn = view(0).render(np.empty((0, 7)), np.empty((0, 3)))
     np.testing.assert_array_equal(drawn.image, view(0).backdrop().image)
     assert not drawn.names.any()
 
 
 def test_images_of_one_stamp_are_equal_and_of_others_differ_by_noise_only():
+    """The spread of the difference is that of two noises."""
     still = view(1).backdrop().image
     stamp_ns = 1_700_000_000_000_000_000
     first = view(1).exposed(still, stamp_ns)
@@ -217,12 +224,14 @@ def test_images_of_one_stamp_are_equal_and_of_others_differ_by_noise_only():
 
 
 def test_light_that_drops_darkens_the_image():
+    """At 0.7 of the light the mean of the image is 0.7 of what it was."""
     still, dark = view(1).backdrop().image, view(1).exposed(view(1).backdrop().image, 1, 0.7)
     assert dark.mean() == pytest.approx(0.7 * still.mean(), rel=0.01)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_no_camera_sees_who_hides_in_the_cabinet(seed):
+    """None of eight cameras does; at least six see the person outside it."""
     stage = Stage(scenario_of("S4", seed, 20.0))
     hidden = stage.scene_at(8.0)
     out = stage.scene_at(15.5)
@@ -234,6 +243,7 @@ def test_no_camera_sees_who_hides_in_the_cabinet(seed):
 
 
 def test_stage_says_what_was_left_and_how_bright_it_is():
+    """A box appears at its second, the light drops at its own, people are counted."""
     left, dark = Stage(scenario_of("S6", 1, 20.0)), Stage(scenario_of("S10", 1, 20.0))
     from_s = left.scenario.things[0].from_s
     assert left.things_at(from_s - 0.01) == ()

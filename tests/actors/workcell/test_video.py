@@ -100,6 +100,7 @@ def ago(*seconds):
 
 
 def test_a_device_is_asked_for_what_the_address_says(driver):
+    """Format before size, one buffer, and the rate."""
     driver.letters = "MJPG"
     opened("?size=64x48&fps=30&format=MJPG")
 
@@ -114,6 +115,7 @@ def test_a_device_is_asked_for_what_the_address_says(driver):
 
 
 def test_what_the_driver_gives_instead_is_told_before_the_first_image(driver):
+    """Another size, format or rate is refused, and the device released each time."""
     assert "asked for 96 x 72 pixels; the driver gives 64 x 48; v4l2-ctl" in refused("?size=96x72")
     assert "asked for the format MJPG; the driver gives YUYV" in refused("?format=MJPG")
     driver.rate = 5.0
@@ -125,6 +127,7 @@ def test_what_the_driver_gives_instead_is_told_before_the_first_image(driver):
 
 
 def test_images_of_another_size_than_the_driver_said_are_refused(driver):
+    """The size is compared with the calibration again at each frame."""
     source = opened()
     driver.size = (32, 24)
 
@@ -133,6 +136,7 @@ def test_images_of_another_size_than_the_driver_said_are_refused(driver):
 
 
 def test_a_new_calibration_opens_the_device_in_its_size(driver):
+    """The same calibration keeps it open."""
     source = opened()
     source.open(CALIBRATION)
     assert driver.released == 0
@@ -154,6 +158,7 @@ def test_images_from_before_the_tick_are_dropped(driver):
 
 
 def test_images_without_a_time_of_the_driver_are_not_those_of_its_queue(driver):
+    """The queue is dropped, and the image is stamped when it comes."""
     driver.stamped = False
     source, tick_ns = opened(), time.time_ns()
     driver.queue = ago(0.4, 0.3, 0.2, 0.1)
@@ -163,6 +168,7 @@ def test_images_without_a_time_of_the_driver_are_not_those_of_its_queue(driver):
 
 
 def test_a_driver_whose_time_stands_still_has_none(driver):
+    """A time that does not move on is not believed, so the queue is dropped."""
     driver.stands_still = True
     source = opened()
     tick_ns = time.time_ns()
@@ -184,6 +190,7 @@ def test_a_queue_that_never_ends_holds_nobody_up(driver):
 
 
 def test_a_camera_that_was_unplugged_comes_back(driver):
+    """The device is released, refused while it is away, and gives images when it is back."""
     source = opened()
     driver.plugged = False
     with pytest.raises(CameraError, match="the device gave none; was it unplugged"):
@@ -200,6 +207,7 @@ def test_a_camera_that_was_unplugged_comes_back(driver):
 
 
 def test_a_damaged_image_is_replaced_by_the_next_one(driver):
+    """Two in a row are passed over; the third is an error."""
     source = opened()
     driver.damaged = 2
     assert level(source) == 200
@@ -210,6 +218,7 @@ def test_a_damaged_image_is_replaced_by_the_next_one(driver):
 
 
 def test_time_of_a_driver_becomes_time_since_1970():
+    """A monotonic time is converted; zero and a time since 1970 count as none."""
     half_a_second_ago_ms = time.monotonic_ns() / 1e6 - 500.0
     assert time.time_ns() - driver_ns(half_a_second_ago_ms) == pytest.approx(5e8, rel=0.2)
     assert driver_ns(0.0) == 0
@@ -217,6 +226,7 @@ def test_time_of_a_driver_becomes_time_since_1970():
 
 
 def test_a_device_of_another_user_is_named(driver, monkeypatch):
+    """A device that may not be read is an error that names the group."""
     monkeypatch.setattr("os.access", lambda *_: False)
 
     assert "this user may not read; a device belongs to the group video" in refused()

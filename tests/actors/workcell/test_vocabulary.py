@@ -76,6 +76,7 @@ def _same(one: Any, other: Any) -> bool:
 
 @pytest.mark.parametrize(("aspect", "datum"), EXAMPLES)
 def test_a_datum_comes_back_as_it_was_written(aspect: Aspect[Any], datum: object) -> None:
+    """Written under one lock, read under the next, the example of each aspect is the same."""
     with local(worlds=["online"]) as cell:
         request = Write(cell.world("online"), Entity("thing"), aspect)
         with Lock(request) as lock:
@@ -85,6 +86,7 @@ def test_a_datum_comes_back_as_it_was_written(aspect: Aspect[Any], datum: object
 
 
 def test_every_structured_aspect_has_an_example() -> None:
+    """An aspect whose datum is a dataclass cannot be added without one."""
     structured = {
         aspect.name
         for aspect in vars(words).values()
