@@ -57,7 +57,7 @@ class BoundRequests:
 
     Attributes:
         single: For each request of one entity, by its `id`: its slot, aspect, and whether it allows
-            writing.  Valid while whoever uses it keeps the requests.
+            writing.  Valid while the caller keeps the requests.
         reads: The slots of those that show one datum and do not write it.
         items: The lines of the protocol, as asked for while no datum is cached.
         known_at: The state of the catalogues in which all aspects were found settled.
