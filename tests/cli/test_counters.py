@@ -19,6 +19,7 @@ OF_CLIENTS = (
     "client/transfer.py",
 )
 CALLS = {"count", "_count"}
+TABLES = {"counters", "_counters"}
 
 
 def counted(paths):
@@ -31,6 +32,10 @@ def counted(paths):
                 first = node.args[0]
                 if called in CALLS and isinstance(first, ast.Constant):
                     names.add(first.value)
+            elif isinstance(node, ast.AugAssign) and isinstance(node.target, ast.Subscript):
+                table = getattr(node.target.value, "attr", getattr(node.target.value, "id", ""))
+                if table in TABLES and isinstance(node.target.slice, ast.Constant):
+                    names.add(node.target.slice.value)
             elif isinstance(node, ast.AugAssign) and isinstance(node.target, ast.Subscript):
                 table, key = node.target.value, node.target.slice
                 named = getattr(table, "attr", "").lstrip("_") == "counters"
