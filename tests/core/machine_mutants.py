@@ -19,15 +19,15 @@ from enact_dist.core.state.commits import Commits
 from enact_dist.core.state.decisions import Decisions
 from enact_dist.core.state.grants import Tenure, Tenures
 from enact_dist.core.state.history import History
-from enact_dist.core.state.sessions import Session, SessionTable
+from enact_dist.core.state.sessions import SessionState, SessionTable
 from enact_dist.core.state.slots import SlotMap
 from enact_dist.terms import NullReason
 
 
 def lease_ends_a_nanosecond_late(patch):
     """A lease lives one nanosecond too long."""
-    lease_end_ns = Session.lease_end_ns
-    patch(Session, "lease_end_ns", lambda session, now_ns: lease_end_ns(session, now_ns) + 1)
+    lease_end_ns = SessionState.lease_end_ns
+    patch(SessionState, "lease_end_ns", lambda session, now_ns: lease_end_ns(session, now_ns) + 1)
 
 
 def any_token_of_this_epoch(patch):

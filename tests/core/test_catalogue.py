@@ -168,15 +168,15 @@ def test_shard_with_an_older_store_that_is_too_full_says_hello():
 def test_who_reads_figures_meanwhile_leaves_no_catalogue_of_before_behind(bench, monkeypatch):
     """Figures are taken without the shard's mutex: here between a look and a registration."""
     known = bench.shard.state.catalogue
-    real = catalogue.Shown
+    real = catalogue.CatalogueExcerpt
 
     def registered_meanwhile(*parts):
-        monkeypatch.setattr(catalogue, "Shown", real)
+        monkeypatch.setattr(catalogue, "CatalogueExcerpt", real)
         bench.ask(Register("ann", ("later",), ()))
         return real(*parts)
 
     known.add_world(WorldEntry("soon"))
-    monkeypatch.setattr(catalogue, "Shown", registered_meanwhile)
+    monkeypatch.setattr(catalogue, "CatalogueExcerpt", registered_meanwhile)
     inspection.counted(bench.shard.state)
 
     assert "later" in bench.ask(HELLO).worlds

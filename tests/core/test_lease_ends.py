@@ -19,7 +19,7 @@ from enact_dist.core.protocol.messages import (
 )
 from enact_dist.core.protocol.records import SessionSeen, Tick
 from enact_dist.core.state.clock import STALE_MAX, DueTimes
-from enact_dist.core.state.sessions import IDLE_TTLS, Session
+from enact_dist.core.state.sessions import IDLE_TTLS, SessionState
 from enact_dist.terms import Access
 
 NAMES = ("ann", "bob", "cec", "dan", "eva")
@@ -125,14 +125,14 @@ def test_tick_with_many_sessions_looks_at_those_that_are_due(monkeypatch):
         bench.granted(lock_id(f"s{number}"), item(Access.READ))
     bench.hello("ann", ttl_ns=S)
     bench.granted(lock_id("ann"), item(Access.READ))
-    lease_end_ns = Session.lease_end_ns
+    lease_end_ns = SessionState.lease_end_ns
 
     def looking(session, now_ns):
         nonlocal looks
         looks += 1
         return lease_end_ns(session, now_ns)
 
-    monkeypatch.setattr(Session, "lease_end_ns", looking)
+    monkeypatch.setattr(SessionState, "lease_end_ns", looking)
     for _ in range(20):
         bench.now_ns += 100 * MS
         bench.event(Tick())

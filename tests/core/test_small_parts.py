@@ -17,7 +17,7 @@ from enact_dist.core.protocol.records import NOTHING, AuditRecord, Content, Slot
 from enact_dist.core.state.audit import ALARM, ENTRIES_MAX, SETTLED, Audit
 from enact_dist.core.state.catalogue import Catalogue
 from enact_dist.core.state.clock import AHEAD_NS_MAX, Stamps
-from enact_dist.core.state.sessions import Session
+from enact_dist.core.state.sessions import SessionState
 from enact_dist.core.state.slots import INLINE_BYTES_MAX, SlotMap
 from enact_dist.terms import Access, NullReason
 
@@ -113,7 +113,7 @@ class TestLease:
         self, renewed_ns, token, now_ns, ends_ns
     ):
         """max(last keep-alive + TTL, token last seen + TTL / 2)."""
-        session = Session("s", 100, renewed_ns=renewed_ns)
+        session = SessionState("s", 100, renewed_ns=renewed_ns)
         if token is not None:
             session.token_present, session.token_seen_ns = token
 

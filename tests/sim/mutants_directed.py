@@ -19,7 +19,7 @@ from enact_dist.core.shard.on_lock import LockDesk
 from enact_dist.core.shard.on_view import ViewDesk
 from enact_dist.core.state.commits import Commits
 from enact_dist.core.state.grants import Tenures
-from enact_dist.core.state.sessions import Session, SessionTable
+from enact_dist.core.state.sessions import SessionState, SessionTable
 from enact_dist.core.state.slot_history import SlotHistory
 from enact_dist.core.state.slots import SlotMap
 from enact_dist.terms import Durability
@@ -44,8 +44,8 @@ def takes_grants_of_an_old_epoch(patch: Patch) -> None:
 
 def leases_end_late(patch: Patch) -> None:
     """A lease ends one nanosecond after its TTL (`<` for `<=`)."""
-    lease_end_ns = Session.lease_end_ns
-    patch(Session, "lease_end_ns", lambda session, now_ns: lease_end_ns(session, now_ns) + 1)
+    lease_end_ns = SessionState.lease_end_ns
+    patch(SessionState, "lease_end_ns", lambda session, now_ns: lease_end_ns(session, now_ns) + 1)
 
 
 def compares_no_token(patch: Patch) -> None:

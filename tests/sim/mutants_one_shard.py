@@ -26,7 +26,7 @@ from enact_dist.core.state.clock import Stamps
 from enact_dist.core.state.commits import Commits
 from enact_dist.core.state.grants import Tenure, Tenures
 from enact_dist.core.state.lock_table import Mode
-from enact_dist.core.state.sessions import Lane, Session, SessionTable
+from enact_dist.core.state.sessions import Lane, SessionState, SessionTable
 from enact_dist.core.state.slots import SlotMap
 from enact_dist.terms import Durability, NullReason
 
@@ -61,8 +61,8 @@ def no_fence(patch: Patch) -> None:
 
 def expires_early(patch: Patch) -> None:
     """A lease ends a tenth of its TTL too early."""
-    lease_end_ns = Session.lease_end_ns
-    patch(Session, "lease_end_ns", lambda s, now_ns: lease_end_ns(s, now_ns) - s.ttl_ns // 10)
+    lease_end_ns = SessionState.lease_end_ns
+    patch(SessionState, "lease_end_ns", lambda s, now_ns: lease_end_ns(s, now_ns) - s.ttl_ns // 10)
 
 
 def barges(patch: Patch) -> None:

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.pages import Step
     from enact_dist.core.protocol.records import Content
     from enact_dist.core.shard.state import ShardState
-    from enact_dist.core.state.sessions import Session
+    from enact_dist.core.state.sessions import SessionState
 
 REPORT_BYTES_MAX: Final = 4096
 """Longest report of an actor in a listing; a longer one is left out."""
@@ -87,7 +87,7 @@ def sessions(state: ShardState, message: ListSessions) -> Sessions:
     )
 
 
-def _session_info(state: ShardState, session: Session) -> SessionInfo:
+def _session_info(state: ShardState, session: SessionState) -> SessionInfo:
     return SessionInfo(
         session.session,
         session.actor,

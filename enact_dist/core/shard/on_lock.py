@@ -22,7 +22,7 @@ from enact_dist.core.protocol.messages import (
 from enact_dist.core.protocol.records import Effect, Reply
 from enact_dist.core.shard import owners
 from enact_dist.core.state.grants import Shape, shape_of
-from enact_dist.core.state.sessions import LANES_MAX, Lane, Session
+from enact_dist.core.state.sessions import LANES_MAX, Lane, SessionState
 from enact_dist.terms import ACCESSES
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ class LockDesk:
         return effects
 
     def _kept_out(
-        self, message: Acquire, session: Session, reply_to: int
+        self, message: Acquire, session: SessionState, reply_to: int
     ) -> Iterable[Effect] | None:
         """Return why a new lock gets no place in the queue, None if it gets one in its lane."""
         state, lock = self._state, message.lock
@@ -133,7 +133,7 @@ class LockDesk:
                     return Refused(NEWER_TYPE, text)
         return None
 
-    def _has_its_share(self, session: Session) -> bool:
+    def _has_its_share(self, session: SessionState) -> bool:
         """Whether the identity of a session has as many locks as one may have."""
         if not session.identity:
             return False

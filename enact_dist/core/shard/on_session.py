@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from collections.abc import Generator, Iterable, Iterator
 
     from enact_dist.core.shard.state import ShardState
-    from enact_dist.core.state.sessions import Session
+    from enact_dist.core.state.sessions import SessionState
 
 TTL_NS_MIN: Final = 100_000_000
 """Leases shorter than this would be lost to ordinary scheduling delays."""
@@ -54,7 +54,7 @@ class SessionDesk:
     def __init__(self, state: ShardState) -> None:
         self._state = state
         self._unanswered: dict[int, list[Reply]] = {}
-        self._recording: dict[str, Session] = {}
+        self._recording: dict[str, SessionState] = {}
         self._count = 0
 
     def on_hello(self, message: Hello, reply_to: int) -> Iterator[Effect]:
@@ -120,7 +120,7 @@ class SessionDesk:
         answer: Answer,
         records: tuple[Record, ...],
         durability: Durability = Durability.DURABLE,
-        session: Session | None = None,
+        session: SessionState | None = None,
     ) -> Iterator[Effect]:
         """Answer when `records` are kept, and all before them that the answer may tell of.
 
@@ -142,7 +142,7 @@ class SessionDesk:
         else:
             yield reply
 
-    def _durable(self, number: int, session: Session | None, _: int) -> Iterable[Effect]:
+    def _durable(self, number: int, session: SessionState | None, _: int) -> Iterable[Effect]:
         """Answer: the records are kept."""
         if session is not None and self._recording.get(session.session) is session:
             del self._recording[session.session]

@@ -59,7 +59,7 @@ and these, then they are swept out."""
 T = TypeVar("T")
 
 
-class Waiting(NamedTuple, Generic[T]):
+class ParkedRequest(NamedTuple, Generic[T]):
     """One parked question: whose it is, and when its wait is over."""
 
     question: T
@@ -72,7 +72,7 @@ class Order:
 
     __slots__ = ("_heap", "_parked")
 
-    def __init__(self, parked: dict[int, Waiting[T]]) -> None:
+    def __init__(self, parked: dict[int, ParkedRequest[T]]) -> None:
         self._parked = parked
         self._heap: list[tuple[int, int]] = []
 
@@ -97,7 +97,7 @@ class Parked(Generic[T]):
     __slots__ = ("_by_end", "_of_session", "by_reply")
 
     def __init__(self) -> None:
-        self.by_reply: dict[int, Waiting[T]] = {}
+        self.by_reply: dict[int, ParkedRequest[T]] = {}
         self._by_end = Order(self.by_reply)
         self._of_session: dict[str, dict[int, None]] = {}
 
@@ -106,7 +106,7 @@ class Parked(Generic[T]):
 
     def add(self, reply_to: int, question: T, *, session: str, end_ns: int) -> int | None:
         """Park a request; return the oldest one of its session if that has too many."""
-        self.by_reply[reply_to] = Waiting(question, session, end_ns)
+        self.by_reply[reply_to] = ParkedRequest(question, session, end_ns)
         self._by_end.add(end_ns, reply_to)
         of_session = self._of_session.setdefault(session, {})
         of_session[reply_to] = None

@@ -26,7 +26,7 @@ from enact_dist.core.state.clock import Stamps, newest_stamp
 from enact_dist.core.state.commits import Commits
 from enact_dist.core.state.decisions import Decisions
 from enact_dist.core.state.grants import Tenure, Tenures
-from enact_dist.core.state.sessions import LANES_MAX, Session, SessionTable
+from enact_dist.core.state.sessions import LANES_MAX, SessionState, SessionTable
 from enact_dist.core.state.slots import SlotMap
 
 if TYPE_CHECKING:
@@ -244,7 +244,7 @@ class ShardState:
             self.count("epoch_refusals")
         return EpochChanged(self.epoch)
 
-    def session_in_epoch(self, session: str, epoch: int) -> Session | None:
+    def session_in_epoch(self, session: str, epoch: int) -> SessionState | None:
         """Return the session if it and the client's idea of the epoch are current."""
         if epoch != self.epoch:
             self.count("epoch_refusals")

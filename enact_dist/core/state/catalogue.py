@@ -38,7 +38,7 @@ REMEDY: Final = (
 )
 
 
-class Shown(NamedTuple):
+class CatalogueExcerpt(NamedTuple):
     """What a `Welcome` shows of a catalogue, and how much it leaves out."""
 
     worlds: tuple[str, ...]
@@ -81,7 +81,7 @@ class Catalogue:
         self._forks: dict[str, WorldEntry] = {}
         self.successions = 0
         self.bytes = 0
-        self._shown: Shown | None = None
+        self._shown: CatalogueExcerpt | None = None
         for world in worlds:
             # That it is a fork is known of a context which is also named elsewhere.
             if world.source or world.name not in self.worlds:
@@ -188,7 +188,7 @@ class Catalogue:
             f" at most {WORLDS_MAX}, of {CATALOGUE_BYTES_MAX} bytes with all aspects; {REMEDY}",
         )
 
-    def shown(self) -> Shown:
+    def shown(self) -> CatalogueExcerpt:
         """Return what a `Welcome` has room for: normally the whole catalogue.
 
         If it is too large, the smallest entries: a few large entries fill it, or very many.
@@ -205,15 +205,15 @@ class Catalogue:
         """
         return (self._shown or self._now_shown()).left_out
 
-    def _now_shown(self) -> Shown:
+    def _now_shown(self) -> CatalogueExcerpt:
         all_aspects = tuple(self.aspects.values())
         if self.bytes <= CATALOGUE_BYTES_MAX:
             # Rebuilt after each registration: no Python step per entry.
-            return Shown(tuple(self.worlds), all_aspects, tuple(self._forks.values()), 0)
+            return CatalogueExcerpt(tuple(self.worlds), all_aspects, tuple(self._forks.values()), 0)
         all_worlds, half = tuple(self.worlds.values()), CATALOGUE_BYTES_MAX // 2
         aspects = tuple(_that_fit(sorted(all_aspects, key=bytes_in_frame), bytes_in_frame, half))
         worlds = tuple(_that_fit(all_worlds, _world_bytes, half))
-        return Shown(
+        return CatalogueExcerpt(
             tuple(world.name for world in worlds),
             aspects,
             tuple(world for world in worlds if world.source),

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from enact_dist.core.protocol.records import PreparedRecord
-    from enact_dist.core.state.sessions import Session, SessionTable
+    from enact_dist.core.state.sessions import SessionState, SessionTable
 
 WAIT_SLICE_NS_MAX: Final = 1_000_000_000
 """Longest time one request is parked; a client that still waits asks again (long poll)."""
@@ -204,7 +204,7 @@ class Tenures:
             self.shapes[items] = shape_of(items)
 
     def enqueue(
-        self, message: Acquire, shape: Shape, session: Session, *, now_ns: int, at_once: bool
+        self, message: Acquire, shape: Shape, session: SessionState, *, now_ns: int, at_once: bool
     ) -> Tenure:
         """Give a new lock its place in the queue; with `at_once` its grant if nothing waits."""
         lock, items, hold_ns = message.lock, message.items, message.hold_ns
@@ -242,7 +242,7 @@ class Tenures:
         else:
             self.waiting_of.pop(tenure.owner, None)
 
-    def _add(self, tenure: Tenure, session: Session | None) -> None:
+    def _add(self, tenure: Tenure, session: SessionState | None) -> None:
         lock, name = tenure.lock, tenure.lock.session
         if session is not None:
             tenure.owner = session.identity
@@ -254,7 +254,7 @@ class Tenures:
         if name not in self._lease_ends.due and name not in self._over:
             self._expect_end(name, session, now_ns=tenure.asked_ns)
 
-    def _expect_end(self, name: str, session: Session | None, *, now_ns: int) -> None:
+    def _expect_end(self, name: str, session: SessionState | None, *, now_ns: int) -> None:
         """Look at a session that has locks, and is not looked at yet, when its lease may end."""
         if session is None:
             self._over[name] = None

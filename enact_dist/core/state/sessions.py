@@ -74,7 +74,7 @@ class _Retired:
 
 
 @dataclass(slots=True)
-class Session:
+class SessionState:
     """One client process as a shard sees it.
 
     `acknowledged` says that it has dropped all grants of earlier epochs; until every recovered
@@ -180,7 +180,7 @@ class SessionTable:
         outcomes: Iterable[OutcomeRecord] = (),
         now_ns: int,
     ) -> None:
-        self.by_id: dict[str, Session] = {}
+        self.by_id: dict[str, SessionState] = {}
         self._idle = DueTimes()
         self._tokens: dict[tuple[str, str], None] = {}
         self._retired: dict[str, _Retired] = {}
@@ -189,7 +189,7 @@ class SessionTable:
         self.shortest_ttl_ns: int | None = None
         for record in recovered:
             self._add(
-                Session(
+                SessionState(
                     record.session,
                     record.ttl_ns,
                     renewed_ns=now_ns,
@@ -210,13 +210,13 @@ class SessionTable:
         longest_ns = max((session.ttl_ns for session in self.by_id.values()), default=0)
         self.grace_end_ns = now_ns + longest_ns * (100 + 2 * DRIFT_PER_CENT) // 100
 
-    def _add(self, session: Session) -> None:
+    def _add(self, session: SessionState) -> None:
         self.by_id[session.session] = session
         self._idle.put(session.session, session.idle_ns(session.renewed_ns))
         self._ttls[session.ttl_ns] += 1
         self.shortest_ttl_ns = min(self.shortest_ttl_ns or session.ttl_ns, session.ttl_ns)
 
-    def __iter__(self) -> Iterator[Session]:
+    def __iter__(self) -> Iterator[SessionState]:
         return iter(self.by_id.values())
 
     def in_grace(self, now_ns: int) -> bool:
@@ -239,7 +239,7 @@ class SessionTable:
         """Return the sessions of an identity."""
         return self._of_identity.get(identity, ())
 
-    def _disown(self, session: Session) -> None:
+    def _disown(self, session: SessionState) -> None:
         mine = self._of_identity.get(session.identity, set())
         mine.discard(session.session)
         if not mine:
@@ -253,7 +253,7 @@ class SessionTable:
         awaited = self._recovered if self.in_grace(now_ns) else 0
         return len(self.by_id) >= SESSIONS_MAX + min(awaited, SESSIONS_MAX)
 
-    def unproven(self, now_ns: int) -> Iterator[Session]:
+    def unproven(self, now_ns: int) -> Iterator[SessionState]:
         """Yield sessions, the oldest first, that showed no sign of life since their hello.
 
         Only the oldest of all are looked at: it is asked for each hello beyond the bound.
@@ -266,14 +266,14 @@ class SessionTable:
 
     def hello(
         self, message: Hello, *, identity: str, epoch: int, ttl_ns: int, now_ns: int
-    ) -> tuple[Session, bool]:
+    ) -> tuple[SessionState, bool]:
         """Open or refresh a session; say also whether it needs a durable record first.
 
         Only the exact epoch counts as an acknowledgement of it.
         """
         session = self.by_id.get(message.session)
         if session is None:
-            session = Session(message.session, ttl_ns, renewed_ns=now_ns, acknowledged=True)
+            session = SessionState(message.session, ttl_ns, renewed_ns=now_ns, acknowledged=True)
             retired = self._retired.pop(message.session, None)
             if retired is not None:
                 session.lanes, session.act = retired.lanes, retired.act
@@ -294,7 +294,7 @@ class SessionTable:
             session.acknowledged = True
         return session, not message.observer and (bound or not session.durable)
 
-    def known(self, session: str) -> Session | None:
+    def known(self, session: str) -> SessionState | None:
         """Return the session if it has sent a hello in this epoch."""
         found = self.by_id.get(session)
         return found if found is not None and found.present else None
@@ -329,12 +329,12 @@ class SessionTable:
             if session.token_seen_ns is not None:
                 session.token_seen_ns += gap_ns
 
-    def idle(self, now_ns: int) -> list[Session]:
+    def idle(self, now_ns: int) -> list[SessionState]:
         """Return sessions that have shown no sign of life for `IDLE_TTLS` TTLs.
 
         They are looked at once more at the next call, unless they are forgotten by then.
         """
-        idle: list[Session] = []
+        idle: list[SessionState] = []
         if self.in_grace(now_ns):
             return idle
         for name in self._idle.take(now_ns):
