@@ -86,14 +86,12 @@ class Lock(Triggered):
     An array arrives read-only: ``lock[joints] += 1`` works on it in place, which numpy refuses
     ("output array is read-only").  Write ``lock[joints] = lock[joints] + 1``.
 
-    What is assigned is published, nothing else: a list or dict that was changed in place is to be
-    assigned, too (``lock[flags] = {**lock[flags], "b": True}``).  What a block reads is its own.
-    An assignment takes what the value is at that moment; a later change needs another one.
+    Only what is assigned is published: assign a list or dict anew after changing it in place
+    (``lock[flags] = {**lock[flags], "b": True}``).  An assignment takes the value of that moment.
 
     Args:
-        requests: What to read, write and view; of one cell, of any of its contexts and shards.
-            Writes on several shards become visible all or none, whatever crashes.  At most 4,096
-            requests, and at most 4,096 written data.
+        requests: What to read, write and view, in any contexts and shards of one cell: at most
+            4,096 requests and 4,096 written data.  All writes become visible, or none.
         wait_s: How long to wait for the grant.
         hold_s: How long it may be held at most after the grant.
 
@@ -179,7 +177,9 @@ class Lock(Triggered):
         return self
 
     def _items(self) -> tuple[Item, ...]:
-        return self._session.items_of(self._bound, self._requests)
+        if self._session.cache.known.keys().isdisjoint(self._bound.slots):
+            return self._bound.items
+        return tuple(map(self._session.item_of, self._requests))
 
     def __exit__(
         self,
@@ -201,12 +201,12 @@ class Lock(Triggered):
                 shown, assigned = self._readings.changeable, self._writing.looked_at
                 if shown or assigned:
                     refuse_changed(shown, assigned, self._writing.data, self._requests)
-                self._writing.fix()
+                if self._writing.drafts:
+                    self._writing.fix()
                 only = lock.parts[0].shard if len(lock.parts) == 1 else ""
                 writes = self._writing.by_shard(lock.shard_of, only)
-                reads = _NO_READS
-                if writes:
-                    reads = reads_of(self._readings, self._bound.reads, self._each)
+                asked = self._bound.reads
+                reads = reads_of(self._readings, asked, self._each) if writes else _NO_READS
                 client.finish(lock, writes, tuple(self._expects.values()), *reads)
                 self.position = lock.position
         finally:

@@ -128,14 +128,6 @@ class Session:
             bound.known_at = state  # as it was before: a change meanwhile is looked at next time
         return prepared
 
-    def items_of(
-        self, bound: BoundRequests, requests: Iterable[LockRequest[Any]]
-    ) -> tuple[Item, ...]:
-        """Return the protocol's lines for bound requests, with the versions that are cached."""
-        if self.cache.known.keys().isdisjoint(bound.slots):
-            return bound.items
-        return tuple(map(self.item_of, requests))
-
     def prepare(self, requests: Iterable[LockRequest[Any]], *, wait_s: float | None = None) -> int:
         """Make sure that the aspects of a lock or view can be used: register what it may write.
 

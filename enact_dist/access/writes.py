@@ -120,15 +120,16 @@ class Writing:
 
     Attributes:
         data: What the commit sets; None writes null.
+        drafts: Of these the ones in memory of a shard, or that were handed out to be filled.
         edits: How often that was changed.
         looked_at: What of it was handed out since it was set, and can be changed in place.
     """
 
-    __slots__ = ("_by_slot", "_bytes", "_payloads", "data", "edits", "looked_at")
+    __slots__ = ("_bytes", "_payloads", "data", "drafts", "edits", "looked_at")
 
     def __init__(self, payloads: SharedPayloads) -> None:
         self._payloads = payloads
-        self._by_slot: dict[Slot, _Written] = {}
+        self.drafts: dict[Slot, _Written] = {}
         self._bytes = 0
         self.data: dict[Slot, Datum | None] = {}
         self.edits = 0
@@ -152,14 +153,13 @@ class Writing:
             MisuseError: It is more than one lock may write.
             NoRoomError: The shard's cap is reached.
         """
-        size = self._size_with(slot, encoded.size)
-        if encoded.size <= PAYLOAD_BYTES_MIN and slot not in self._by_slot:
-            self.data[slot] = encoded.datum()
-            self.looked_at.pop(slot, None)
-            self._bytes = size
-            self.edits += 1
-        else:
+        size = encoded.size
+        if size or slot in self.drafts or slot in self.data or len(self.data) >= ITEMS_MAX:
+            size = self._size_with(slot, size)
             self._note(slot, self._written(slot, encoded, shard_of), size)
+        else:  # a number or a short text, for the first time
+            self.data[slot] = encoded.datum()
+            self.edits += 1
 
     def written(self, slot: Slot, aspect: Aspect[Any]) -> Any:
         """Return the value that a slot was set to.
@@ -204,10 +204,10 @@ class Writing:
 
     def _note(self, slot: Slot, written: _Written | None, size: int) -> None:
         """Let something take the place of what was written to a slot; `size` as `_size_with`."""
-        if slot in self._by_slot:
+        if slot in self.drafts:
             self._forget(slot)
         if written is not None and (written.draft is not None or written.arrays):
-            self._by_slot[slot] = written
+            self.drafts[slot] = written
         self.data[slot] = written.datum if written is not None else None
         self.looked_at.pop(slot, None)
         self._bytes = size
@@ -231,7 +231,7 @@ class Writing:
             MisuseError: The size exceeds what one lock may write, or this slot has a blank already.
             NoRoomError: The shard's cap is reached.
         """
-        held = self._by_slot.get(slot)
+        held = self.drafts.get(slot)
         if held is not None and held.arrays:
             raise MisuseError(
                 f"new() has handed out a datum of {slot.entity}/{slot.aspect} in this block"
@@ -283,7 +283,7 @@ class Writing:
 
     def _forget(self, slot: Slot) -> None:
         """Drop what was written to a slot: something else takes its place."""
-        old = self._by_slot.pop(slot, None)
+        old = self.drafts.pop(slot, None)
         if old is not None:
             _fix(old)
             if old.draft is not None:
@@ -291,7 +291,7 @@ class Writing:
 
     def fix(self) -> None:
         """Make all of it read-only: it is about to be committed."""
-        for slot, written in self._by_slot.items():
+        for slot, written in self.drafts.items():
             for array in written.arrays:
                 array.flags.writeable = False
             datum = written.datum
@@ -300,9 +300,9 @@ class Writing:
 
     def end(self, *, committed: bool) -> None:
         """Release it after the lock has ended."""
-        for slot in list(self._by_slot):
+        for slot in list(self.drafts):
             if committed:
-                _fix(self._by_slot.pop(slot))
+                _fix(self.drafts.pop(slot))
             else:
                 self._forget(slot)
         self.data.clear()

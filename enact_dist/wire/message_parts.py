@@ -132,14 +132,19 @@ def _writer_of_each(writers: list[tuple[int, Write]]) -> Write:
     write_part = _writer_of_part(writers)
 
     def write(values: Any, bodies: BodyWriter) -> list[Any]:
-        if more:
-            return [write_part(value, bodies) for value in values]
+        return [write_part(value, bodies) for value in values]
+
+    def write_data(values: Any, bodies: BodyWriter) -> list[Any]:
         written = []
         for value in values:
             parts = list(value)
-            parts[index] = write_one(parts[index], bodies)
+            if parts[index] is not None:
+                parts[index] = bodies.add(parts[index])
             written.append(parts)
         return written
+
+    if write_one is _write_datum and not more:
+        return write_data
 
     return write
 

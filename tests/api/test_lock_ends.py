@@ -153,7 +153,7 @@ def test_lock_raises_when_left_twice(cell, online):
     left.__exit__(None, None, None)
     with pytest.raises(LockReleasedError, match="cannot be left"):
         left.__exit__(None, None, None)
-    assert cell._client._lanes._free == [0]
+    assert cell._client._lanes.free == [0]
 
 
 def test_lock_entered_within_itself_raises_lock_held(online):

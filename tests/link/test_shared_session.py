@@ -281,7 +281,7 @@ def test_lane_of_a_lock_that_is_interrupted_as_it_begins_is_given_back_once(
 
     lanes = client._lanes
     assert len(begun) == attempt
-    assert sorted(lanes._free) == list(range(lanes._made))
+    assert sorted(lanes.free) == list(range(lanes._made))
 
 
 @pytest.mark.parametrize("attempt", [1, 2])
@@ -308,7 +308,7 @@ def test_lock_that_is_interrupted_before_it_is_noted_is_no_lock(session, monkeyp
     lanes = client._lanes
     assert (len(made), len(begun)) == (attempt, attempt - 1)
     assert client.core.live_locks() == []
-    assert sorted(lanes._free) == list(range(lanes._made))
+    assert sorted(lanes.free) == list(range(lanes._made))
 
 
 def test_lock_that_begins_anew_is_noted_before_the_one_before_it_lets_go(session, monkeypatch):
@@ -331,7 +331,7 @@ def test_lock_that_begins_anew_is_noted_before_the_one_before_it_lets_go(session
 
     lanes = client._lanes
     assert client.core.live_locks() == []
-    assert sorted(lanes._free) == list(range(lanes._made))
+    assert sorted(lanes.free) == list(range(lanes._made))
 
 
 # ---------------------------------------------------------------- looked at while it grows

@@ -10,8 +10,8 @@ from enact_dist.core.protocol.records import Persist, Publish
 from enact_dist.core.shard import on_prepare as prepares
 from enact_dist.core.shard.on_world import WorldDesk, _Making
 from enact_dist.core.shard.state import ShardState
-from enact_dist.core.state import commits
 from enact_dist.core.state.commits import Commits
+from enact_dist.core.state.sessions import SessionState
 from enact_dist.core.state.slots import SlotMap
 
 if TYPE_CHECKING:
@@ -25,34 +25,34 @@ if TYPE_CHECKING:
 
 def names_the_lock_before(patch: Patch) -> None:
     """A version names the lock that committed before its own one."""
-    cause_of, last = commits.cause_of, []
+    cause_of, last = SessionState.cause, []
 
-    def wrong(*args: Any, **options: Any) -> Any:
-        last.append(cause_of(*args, **options))
+    def wrong(*args: Any) -> Any:
+        last.append(cause_of(*args))
         return last[-2] if len(last) > 1 else last[0]
 
-    patch(commits, "cause_of", wrong)
+    patch(SessionState, "cause", wrong)
 
 
 def leaves_out_a_read(patch: Patch) -> None:
     """The first datum that a lock has read is not told with its commit."""
-    cause_of = commits.cause_of
+    cause_of = SessionState.cause
 
-    def wrong(*args: Any, **options: Any) -> Any:
-        cause = cause_of(*args, **options)
+    def wrong(*args: Any) -> Any:
+        cause = cause_of(*args)
         return cause._replace(reads=cause.reads[1:])
 
-    patch(commits, "cause_of", wrong)
+    patch(SessionState, "cause", wrong)
 
 
 def prepares_without_a_cause(patch: Patch) -> None:
     """What was prepared is written without saying why."""
-    patch(prepares, "decided_cause", lambda _record, **_options: None)
+    patch(prepares, "_decided_cause", lambda _record, **_options: None)
 
 
 def causes_bear_the_stamp_of_the_promise(patch: Patch) -> None:
     """The cause of what was prepared has the stamp of its promise, not that of the decision."""
-    patch(prepares, "decided_cause", lambda record, **_options: record.cause)
+    patch(prepares, "_decided_cause", lambda record, **_options: record.cause)
 
 
 def causes_are_not_kept(patch: Patch) -> None:

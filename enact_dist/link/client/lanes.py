@@ -44,11 +44,15 @@ KEPT_MAX: Final = 64
 
 
 class Lanes:
-    """The lanes of one session.  Thread-safe."""
+    """The lanes of one session.  Thread-safe.
+
+    Attributes:
+        free: The lanes that no live lock uses; any thread may pop one, or append its own.
+    """
 
     def __init__(self) -> None:
         self._mutex = threading.Lock()
-        self._free: list[int] = []
+        self.free: list[int] = []
         self._kept: deque[int] = deque()
         self._made = 0
 
@@ -59,7 +63,7 @@ class Lanes:
             MisuseError: The session already holds or awaits its maximum of locks.
         """
         try:
-            return self._free.pop()
+            return self.free.pop()
         except IndexError:
             return self._make()
 
@@ -75,11 +79,11 @@ class Lanes:
 
     def give_back(self, lane: int) -> None:
         """Free the lane; call once per `take`, or two locks would share it."""
-        self._free.append(lane)
+        self.free.append(lane)
 
     def keep(self, lane: int) -> None:
         """Keep the outcome of a lane for a while; frees the oldest such lane."""
         with self._mutex:
             self._kept.append(lane)
             if len(self._kept) > KEPT_MAX:
-                self._free.append(self._kept.popleft())
+                self.free.append(self._kept.popleft())

@@ -103,7 +103,8 @@ class CellClient(SessionClient):
         give_up_ns = started_ns + int(min(wait_s, CALLS_S_MAX) * 1e9)
         if started_ns >= self.renewal.used_until_ns:
             self.renewal.used()
-        lane, lock_views = self._lanes.take(), False
+        free, lock_views = self._lanes.free, False
+        lane = free.pop() if free else self._lanes.take()
         try:
             for attempt in itertools.count():
                 with self._mutex:
@@ -370,7 +371,7 @@ class CellClient(SessionClient):
             if lock.phase is Phase.UNKNOWN:
                 self._lanes.keep(lock.lock.lane)
             else:
-                self._lanes.give_back(lock.lock.lane)
+                self._lanes.free.append(lock.lock.lane)
 
     def valid(self, lock: MultiLock) -> bool:
         """Whether the lock's lease still holds by the local clock, without a network call."""
