@@ -6,10 +6,10 @@
  *   shard/on_session.py:on_keep_alive, state/grants.py:take_away   a lock ends; only if it is not `bound`
  *   state/commits.py:_fence, state/commits.py:refusal   FENCE
  *   state/commits.py:validate   validate
- *   shard/on_prepare.py:on_prepare, persisted   prepare, and its record on disk
- *   state/commits.py:commit, persisted, _apply, _recorded   the commit that decides
+ *   shard/on_prepare.py:on_prepare, _persisted   prepare, and its record on disk
+ *   state/commits.py:commit, _persisted, _apply, _recorded   the commit that decides
  *   state/decisions.py:decided, tell, finished   telling the participant
- *   shard/on_prepare.py:on_finish, _finish, persisted   finish, and its end on disk
+ *   shard/on_prepare.py:on_finish, _finish, _persisted   finish, and its end on disk
  *   shard/on_prepare.py:on_resolve, _resolved, on_called   resolve, presumed abort
  *   shard/on_prepare.py:__init__, state/grants.py:restore   restart
  *   client/lock.py:_on_acquiring, finish, _on_vote,

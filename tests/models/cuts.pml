@@ -2,8 +2,8 @@
  *
  * Each step names what it mirrors in enact_dist/core (file:function):
  *   state/clock.py:next, saw, now, shard/state.py:stamp   a shard's clock of stamps
- *   shard/on_prepare.py:on_prepare, _finish, persisted, undecided   prepare, finish at B
- *   state/commits.py:commit, persisted, undecided   the commit that decides, at A
+ *   shard/on_prepare.py:on_prepare, _finish, _persisted, undecided   prepare, finish at B
+ *   state/commits.py:commit, _persisted, undecided   the commit that decides, at A
  *   client/finishing.py:commit   its stamp comes after the prepared ones
  *   shard/on_view.py:on_take_view, _undecided_ns, _viewed   view, and until when it is current
  *   state/slots.py:shown, at, state/slot_history.py:at   the state as of a stamp, if not forgotten

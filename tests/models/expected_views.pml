@@ -3,7 +3,7 @@
  * Each step names what it mirrors in enact_dist/core (file:function):
  *   state/commits.py:moved_on, _in_the_way, _newest_version   still_stands
  *   state/commits.py:validate, _expected   an expectation where nothing is held
- *   state/commits.py:commit, persisted, _apply   a commit that expects something itself
+ *   state/commits.py:commit, _persisted, _apply   a commit that expects something itself
  *   client/lock.py:_acquire (`alone`), finish, _after_votes   the client
  *   state/grants.py:take_away, shard/shard.py:_expire   the end of a lease
  *

@@ -1,7 +1,7 @@
 /* A restarted shard, its grace, and who may still believe in a grant of an earlier epoch.
  *
  * Each step names what it mirrors in enact_dist/core (file:function):
- *   shard/on_session.py:on_hello, persisted, state/sessions.py:hello   hello, durable before it is welcome
+ *   shard/on_session.py:on_hello, _durable, state/sessions.py:hello   hello, durable before it is welcome
  *   shard/on_session.py:on_goodbye, end, shard/shard.py:_on_tick (idle)   the end of a session
  *   shard/on_session.py:on_keep_alive, client/session.py:_alive   keep-alive
  *   state/sessions.py:__init__, in_grace, end_grace_if_all_acknowledged   the grace and its two ends
