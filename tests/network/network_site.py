@@ -115,7 +115,7 @@ class Site:
             client.process.tell("stop")
         for client in clients:
             client.process.expect("done", timeout_s=END_S)
-            self.cell.forget(client.process)
+            self.cell.end(client.process)
         self.cell.watcher.tell("final")
         assert self.cell.watcher.expect("final", timeout_s=END_S) == "committed"
         verdict = judge(load(self.folder))
