@@ -123,9 +123,10 @@ class Session:
         state = catalogue.state
         if bound.known_at is state and state[0] is client.core.placement:
             return lapses
-        prepared = self.prepare(requests, wait_s=wait_s)
-        if client.knows(self._entries_of(requests)[0]):
-            bound.known_at = state  # as it was before: a change meanwhile is looked at next time
+        prepared = self._see_lapses()
+        if not client.knows(self._entries_of(requests)[0]):
+            return self.prepare(requests, wait_s=wait_s)
+        bound.known_at = state  # as it was before: a change meanwhile is looked at next time
         return prepared
 
     def prepare(self, requests: Iterable[LockRequest[Any]], *, wait_s: float | None = None) -> int:

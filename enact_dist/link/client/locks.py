@@ -103,8 +103,11 @@ class CellClient(SessionClient):
         give_up_ns = started_ns + int(min(wait_s, CALLS_S_MAX) * 1e9)
         if started_ns >= self.renewal.used_until_ns:
             self.renewal.used()
-        free, lock_views = self._lanes.free, False
-        lane = free.pop() if free else self._lanes.take()
+        lock_views = False
+        try:
+            lane = self._lanes.free.pop()
+        except IndexError:
+            lane = self._lanes.take()
         try:
             for attempt in itertools.count():
                 with self._mutex:

@@ -30,7 +30,7 @@ from enact_dist.link.socket.frames import (
 from enact_dist.link.socket.peers import PeerCredentials
 from enact_dist.link.socket.watcher import Publisher, SocketWatcher
 from enact_dist.patterns import checked_patterns
-from enact_dist.wire.frames import decode_frame, decode_request, encode_parts
+from enact_dist.wire.frames import decode_frame, decode_request
 
 OPEN_S: Final = 1.0
 """How long a new connection may take to name its session."""
@@ -205,11 +205,7 @@ class SocketConnection:
             self._send(answer)
 
     def _send(self, answer: Answer) -> None:
-        try:
-            header, bodies = encode_parts(answer)
-        except ProtocolError:
-            header, bodies = encoded(answer, self._service.host.count)
-        send_frame(self.connected, header, bodies)
+        send_frame(self.connected, *encoded(answer, self._service.host.count))
 
     def _send_what_fits(self, answer: Answer) -> memoryview | None:
         """Send without blocking; return the rest, which the connection's thread sends."""
