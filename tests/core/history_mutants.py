@@ -9,7 +9,7 @@ from bisect import bisect_left
 from operator import attrgetter
 
 from enact_dist.core.state.history import History
-from enact_dist.core.state.slot_history import SlotHistory
+from enact_dist.core.state.retention import SlotHistory
 from enact_dist.core.state.slots import SlotMap
 
 LATE_NS = 2_000_000_000

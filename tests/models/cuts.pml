@@ -6,7 +6,7 @@
  *   state/commits.py:commit, _persisted, undecided   the commit that decides, at A
  *   client/finishing.py:commit   its stamp comes after the prepared ones
  *   shard/on_view.py:on_take_view, _undecided_ns, _viewed   view, and until when it is current
- *   state/slots.py:shown, at, state/slot_history.py:at   the state as of a stamp, if not forgotten
+ *   state/slots.py:shown, at, state/retention.py:at   the state as of a stamp, if not forgotten
  *   client/cut.py:take, settled   the cut
  *   shard/shard.py:__init__, state/sessions.py:in_grace   restart; the grace waits for a viewer that
  *                                                        locks, not for an observer

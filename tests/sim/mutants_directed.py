@@ -19,8 +19,8 @@ from enact_dist.core.shard.on_lock import LockDesk
 from enact_dist.core.shard.on_view import ViewDesk
 from enact_dist.core.state.commits import Commits
 from enact_dist.core.state.grants import Tenures
+from enact_dist.core.state.retention import SlotHistory
 from enact_dist.core.state.sessions import SessionState, SessionTable
-from enact_dist.core.state.slot_history import SlotHistory
 from enact_dist.core.state.slots import SlotMap
 from enact_dist.terms import Durability
 

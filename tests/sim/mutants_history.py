@@ -10,7 +10,7 @@ from enact_dist.core.protocol.messages import TakeView
 from enact_dist.core.shard.on_history import HistoryDesk
 from enact_dist.core.shard.on_view import ViewDesk
 from enact_dist.core.state.history import History
-from enact_dist.core.state.slot_history import SlotHistory
+from enact_dist.core.state.retention import SlotHistory
 from enact_dist.core.state.slots import SlotMap
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from enact_dist.core.client.client import Client
 from enact_dist.core.client.own_commits import Unsettled
 from enact_dist.core.state.history import History
-from enact_dist.core.state.slot_history import SlotHistory
+from enact_dist.core.state.retention import SlotHistory
 from enact_dist.core.state.slots import Shown, SlotMap
 
 if TYPE_CHECKING:

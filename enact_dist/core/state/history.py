@@ -20,8 +20,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from enact_dist.core.protocol.datum import Slot
 from enact_dist.core.protocol.parts import NO_LIMIT, SlotVersion
 from enact_dist.core.protocol.records import HistoryForgotten, own_bytes
-from enact_dist.core.state.retention import DEFAULT, Limits, PayloadNames
-from enact_dist.core.state.slot_history import KeptVersion, SlotHistory
+from enact_dist.core.state.retention import DEFAULT, KeptVersion, Limits, PayloadNames, SlotHistory
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping

@@ -7,6 +7,7 @@ meets the next call.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import logging
 import os
@@ -76,7 +77,12 @@ class Connection:
         self._poll.register(connected, select.POLLIN)
 
     def __del__(self) -> None:
-        self.socket.close()
+        self.close()
+
+    def close(self) -> None:
+        """Close the socket, even one whose descriptor the program has closed; idempotent."""
+        with contextlib.suppress(OSError):
+            self.socket.close()
 
     def send(self, request: Request, timeout_s: float) -> None:
         """Send a request, for whose answer `receive` waits up to `timeout_s`.
@@ -234,7 +240,7 @@ class SocketLine:
         """Close a connection whose answer was late or invalid."""
         with self._mutex:
             self._open.discard(connection)
-        connection.socket.close()
+        connection.close()
 
     def lost(self, connection: Connection) -> None:
         """Note that a connection has broken: the others are suspect, too."""
@@ -299,7 +305,7 @@ class SocketLine:
         """Close the connections that a forked child has inherited; sends the shard nothing."""
         self.closed = True
         for connection in (*self._open,):
-            connection.socket.close()
+            connection.close()
 
     def close(self) -> None:
         """End all connections; pending calls return without an answer."""
@@ -309,6 +315,6 @@ class SocketLine:
             left = [connection for connection in self._open if connection not in idle]
             self._open.difference_update(idle)
         for connection in idle:
-            connection.socket.close()
+            connection.close()
         for connection in left:
             connection.wake()
