@@ -160,6 +160,7 @@ class Lock(Triggered):
                 hold_s=self._hold_s,
                 interrupt=self._interrupt,
                 begun=begun,
+                keep=self._bound.items,
             )
             if session.unknown or client.catalogue.lapses != prepared:
                 session.check_shown(lock.states, self._requests, prepared)

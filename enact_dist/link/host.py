@@ -59,6 +59,7 @@ from enact_dist.errors import StoreError
 from enact_dist.link.clock import Clock, SystemClock
 from enact_dist.link.host_figures import Stalls, figures_of, latencies_of
 from enact_dist.link.memory.payload_desk import PayloadDesk, half_of, names_payloads
+from enact_dist.link.memory.use_marks import ShardMarks, retains
 from enact_dist.link.signals import Uninterrupted
 
 if TYPE_CHECKING:
@@ -154,6 +155,8 @@ class ShardHost:
         payload_bytes_max: int | None = None,
     ) -> None:
         self._shard = shard
+        if shared is not None and retains():
+            shard.state.tenures.kept.marks = ShardMarks(shared)
         self._clock: Clock = clock or SystemClock()
         self._on_failure = on_failure
         self._payloads = PayloadDesk(

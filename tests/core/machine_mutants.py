@@ -17,10 +17,11 @@ from enact_dist.core.shard.on_view import ViewDesk
 from enact_dist.core.state.clock import Stamps
 from enact_dist.core.state.commits import Commits
 from enact_dist.core.state.decisions import Decisions
-from enact_dist.core.state.grants import Tenure, Tenures
+from enact_dist.core.state.grants import Tenures
 from enact_dist.core.state.history import History
 from enact_dist.core.state.sessions import SessionState, SessionTable
 from enact_dist.core.state.slots import SlotMap
+from enact_dist.core.state.tenure import Tenure
 from enact_dist.terms import NullReason
 
 

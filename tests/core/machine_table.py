@@ -15,8 +15,8 @@ from reference_table import ReferenceTable, lines_of
 
 from enact_dist.core.protocol.datum import LockId, Slot
 from enact_dist.core.protocol.messages import Item
-from enact_dist.core.state.grants import wants_of
 from enact_dist.core.state.lock_table import LockTable, Mode
+from enact_dist.core.state.tenure import wants_of
 from enact_dist.terms import Access
 
 ENTITIES = ("a", "tray/1", "tray/2")

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from enact_dist.core.protocol.datum import Column, LockId, Slot
 from enact_dist.core.protocol.messages import Item
-from enact_dist.core.state.grants import wants_of
 from enact_dist.core.state.lock_table import CONFLICTS, LockTable, Mode, join
+from enact_dist.core.state.tenure import wants_of
 from enact_dist.terms import Access
 
 R, W, RE, WE = Access.READ, Access.WRITE, Access.READ_EACH, Access.WRITE_EACH

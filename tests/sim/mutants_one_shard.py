@@ -24,10 +24,11 @@ from enact_dist.core.state import lock_table
 from enact_dist.core.state.catalogue import Catalogue
 from enact_dist.core.state.clock import Stamps
 from enact_dist.core.state.commits import Commits
-from enact_dist.core.state.grants import Tenure, Tenures
+from enact_dist.core.state.grants import Tenures
 from enact_dist.core.state.lock_table import Mode
 from enact_dist.core.state.sessions import Lane, SessionState, SessionTable
 from enact_dist.core.state.slots import SlotMap
+from enact_dist.core.state.tenure import Tenure
 from enact_dist.terms import Durability, NullReason
 
 if TYPE_CHECKING:

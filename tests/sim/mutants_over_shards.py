@@ -17,7 +17,7 @@ from enact_dist.core.shard.on_prepare import PrepareDesk
 from enact_dist.core.shard.on_view import ViewDesk
 from enact_dist.core.state.commits import Commits
 from enact_dist.core.state.decisions import Decisions
-from enact_dist.core.state.grants import Tenure
+from enact_dist.core.state.tenure import Tenure
 from enact_dist.terms import Durability
 
 if TYPE_CHECKING:

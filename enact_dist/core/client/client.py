@@ -5,18 +5,23 @@ A lock is begun under a plan, which splits what was requested by shard.
 
 from __future__ import annotations
 
+from itertools import repeat
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.core.client.kept import Keeping
+from enact_dist.core.client.lease_clock import shortened_ns
 from enact_dist.core.client.lock import MultiLock
-from enact_dist.core.client.plan import Phase, Plan
+from enact_dist.core.client.plan import Phase, Plan, Reading
 from enact_dist.core.client.session import ClientSession
 from enact_dist.core.protocol.datum import LockId
 from enact_dist.core.protocol.placement import shard_of
+from enact_dist.core.state.tenure import is_keepable
 from enact_dist.terms import ACCESSES, Access
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from enact_dist.core.client.kept import KeptGrant
     from enact_dist.core.protocol.messages import Item, PlacementMap
 
 PLANNED_MAX: Final = 32
@@ -50,6 +55,29 @@ class Client(ClientSession[MultiLock]):
         if multilock.phase.busy:
             self._locks[lock] = multilock
         return multilock
+
+    def begin_kept(
+        self, lane: int, grant: KeptGrant, *, now_ns: int, hold_ns: int
+    ) -> MultiLock | None:
+        """Start a lock under a kept grant whose mark was taken and whose cell was looked at.
+
+        Returns:
+            The lock, held; None if it has to be asked for.
+        """
+        epoch = grant.token.epoch
+        if epoch != self.epoch(grant.shard) or grant.plan.placement != self.placement:
+            return None
+        if now_ns >= grant.until_ns or hold_ns > grant.hold_ns:
+            return None
+        seq = self._seqs[lane] = self._seqs.get(lane, 0) + 1
+        lock = MultiLock(self, LockId(self.session, lane, seq), grant.plan, now_ns, hold_ns)
+        lock.keeping, part = Keeping(grant.items, grant, now_ns), lock.parts[0]
+        part.token, part.granted_count, part.until_ns = grant.token, grant.count, grant.until_ns
+        part.hold_until_ns = now_ns + shortened_ns(hold_ns)
+        lock.states += map(Reading, repeat(part.shard), repeat(epoch), grant.states)
+        lock.phase = Phase.HELD
+        self._locks[lock.lock] = lock
+        return lock
 
     def live_locks(self) -> list[MultiLock]:
         """Return the locks that are not at rest."""
@@ -98,11 +126,13 @@ class Client(ClientSession[MultiLock]):
             here = views.get(only, ())
             if set(views) <= {only} and not self.unsettled.stamp_ns(only, here):
                 locks[only] += views.pop(only, [])
+        keepable = len(locks) == 1 and not views and is_keepable(tuple(next(iter(locks.values()))))
         return Plan(
             tuple([(shard, tuple(locks[shard])) for shard in sorted(locks)]),
             tuple([(shard, tuple(views[shard])) for shard in sorted(views)]),
             self.placement,
             max((self.unsettled.stamp_ns(shard, views[shard]) for shard in views), default=0),
+            keepable=keepable,
         )
 
     def assert_invariants(self) -> None:

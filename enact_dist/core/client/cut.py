@@ -18,13 +18,17 @@ a second time; the first answers count if no shard has restarted until then.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from enact_dist.core.protocol.messages import TakeView
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from enact_dist.core.client.plan import Plan
-    from enact_dist.core.protocol.messages import Item, TakeView, Viewed
+    from enact_dist.core.client.session import ClientSession
+    from enact_dist.core.protocol.datum import LockId
+    from enact_dist.core.protocol.messages import Item, Request, Viewed
 
 ROUNDS_MAX: Final = 8
 """How often shards are asked before the views are given up."""
@@ -93,6 +97,19 @@ class Cut:
     def strict(self) -> bool:
         """Whether it lies where it was asked for: what shards forgot they must not make up for."""
         return bool(self._past_ns)
+
+    def calls(
+        self, lock: LockId, client: ClientSession[Any], map_version: int, now_ns: int
+    ) -> list[tuple[str, Request]]:
+        """Return the requests of this round that have no answer yet."""
+        calls: list[tuple[str, Request]] = []
+        for shard, items in self.items.items():
+            if shard in self.left:
+                count, epoch = client.sendings.next(now_ns), client.epoch(shard)
+                seen_ns, at_ns, strict = client.seen_stamp_ns, self.at_ns, self.strict
+                request = TakeView(lock, epoch, map_version, count, items, seen_ns, at_ns, strict)
+                calls.append((shard, request))
+        return calls
 
     def take(self, shard: str, request: TakeView, answer: Viewed, *, until_ns: int) -> None:
         """Take an answer of this round; others are too late.

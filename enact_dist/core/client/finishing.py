@@ -15,18 +15,29 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
+from enact_dist.core.client.plan import Phase
 from enact_dist.core.protocol.datum import Token
-from enact_dist.core.protocol.messages import Commit, Prepare, SlotVersion, Validate
+from enact_dist.core.protocol.messages import (
+    OUTCOME_EXPIRED,
+    OUTCOME_PENDING,
+    Commit,
+    Prepare,
+    SlotVersion,
+    Validate,
+)
 from enact_dist.core.protocol.placement import shard_of
+from enact_dist.errors import SHARD_RESTARTED
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
+    from enact_dist.core.client.kept import Keeping
     from enact_dist.core.client.plan import Part
     from enact_dist.core.protocol.datum import LockId
     from enact_dist.core.protocol.messages import (
         Changed,
         DatumRead,
+        OutcomeIs,
         PlacementMap,
         Prepared,
         Request,
@@ -71,7 +82,7 @@ class Finishing:
         found = SlotVersion(answer.slot, answer.version)
         return None if any(found in each for each in self.expects.values()) else found
 
-    def votes_to_ask(self, seen_stamp_ns: int) -> list[tuple[str, Request]]:
+    def votes_to_ask(self, seen_stamp_ns: int, *, keep: bool = False) -> list[tuple[str, Request]]:
         """Return the requests to the shards that have not agreed yet."""
         calls: list[tuple[str, Request]] = []
         for shard in self.left:
@@ -89,11 +100,11 @@ class Finishing:
                     self.reads_left_out,
                 )
             else:
-                request = Validate(self.lock, token, expects)
+                request = Validate(self.lock, token, expects, keep)
             calls.append((shard, request))
         return calls
 
-    def commit(self, seen_stamp_ns: int) -> Commit:
+    def commit(self, seen_stamp_ns: int, keeping: Keeping | None, now_ns: int) -> Commit:
         """Return the commit that decides, stamped after everything that was prepared."""
         for answer in self.prepared.values():
             seen_stamp_ns = max(seen_stamp_ns, answer.stamp_ns)
@@ -106,7 +117,19 @@ class Finishing:
             tuple(sorted(self.prepared)) if self.prepared else (),
             self.reads,
             self.reads_left_out,
+            keeping is not None,
+            keeping.used_ns(now_ns) if keeping is not None else 0,
         )
+
+    def not_committed(self, answer: OutcomeIs, cause: str) -> tuple[Phase | None, str]:
+        """Return what an outcome that is no commit means, None if the lock goes on, and why."""
+        self.pending = answer.kind == OUTCOME_PENDING
+        if answer.kind == OUTCOME_EXPIRED:
+            return Phase.UNKNOWN, "its shard has no record of this session any more"
+        if not self.pending and answer.epoch != self.token.epoch:
+            return Phase.LOST, f"{SHARD_RESTARTED} before the commit arrived"
+        self.ask_outcome = self.pending  # else it never arrived: send it (again)
+        return None, cause
 
     def unname(self, refused: Request) -> bool:
         """Let the bytes travel with the messages from now on.

@@ -27,12 +27,11 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.core.client.backoff import RETRY_NS_MAX, RETRY_NS_MIN
 from enact_dist.core.client.cut import ROUNDS_MAX, Cut
 from enact_dist.core.client.finishing import Finishing, by_shard, tokens_of
+from enact_dist.core.client.kept import Keeping
 from enact_dist.core.client.plan import OF_SESSIONS, Part, Phase, Plan, Reading, first_asking
 from enact_dist.core.protocol.checks import NO_PAYLOAD
 from enact_dist.core.protocol.messages import (
     OUTCOME_COMMITTED,
-    OUTCOME_EXPIRED,
-    OUTCOME_PENDING,
     Acquire,
     Answer,
     Changed,
@@ -57,14 +56,19 @@ from enact_dist.core.protocol.messages import (
     WrongShard,
 )
 from enact_dist.core.protocol.placement import shard_of
-from enact_dist.errors import SHARD_RESTARTED
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from enact_dist.core.client.session import ClientSession
     from enact_dist.core.protocol.datum import LockId, Position, Slot
-    from enact_dist.core.protocol.messages import DatumRead, Holder, Request, SlotVersion, WriteItem
+    from enact_dist.core.protocol.messages import (
+        DatumRead,
+        Holder,
+        Request,
+        SlotVersion,
+        WriteItem,
+    )
 
 WAIT_SLICE_NS: Final = 900_000_000
 """How long one call of a waiting lock is parked; below the shard's own limit of 1 s."""
@@ -103,6 +107,7 @@ class MultiLock:
     farewells: list[tuple[str, Request]] = field(default_factory=list)
     cut: Cut | None = None
     unnamed: bool = False  # its bytes travel: the shard has lost the payloads that it named
+    keeping: Keeping | None = None  # if its grant may stay with the session
     _finishing: Finishing | None = None
     _free_calls: int = FREE_CALLS
     _retry_at_ns: int = 0
@@ -138,15 +143,16 @@ class MultiLock:
 
     def _calls(self, now_ns: int) -> list[tuple[str, Request]]:
         if self.cut is not None and self.phase is Phase.VIEWING:
-            return [(shard, self._view(shard, self.cut, now_ns)) for shard in self.cut.left]
+            return self.cut.calls(self.lock, self.client, self.plan.placement.version, now_ns)
         finishing = self._finishing
         assert finishing is not None
         if self.phase is Phase.VALIDATING:
-            return finishing.votes_to_ask(self.client.seen_stamp_ns)
+            return finishing.votes_to_ask(self.client.seen_stamp_ns, keep=self.keeping is not None)
         if finishing.ask_outcome:
             return [(finishing.primary, Outcome(self.lock))]
         finishing.sent = True
-        return [(finishing.primary, finishing.commit(self.client.seen_stamp_ns))]
+        commit = finishing.commit(self.client.seen_stamp_ns, self.keeping, now_ns)
+        return [(finishing.primary, commit)]
 
     def _acquire(self, now_ns: int) -> tuple[str, Request]:
         parts, client = self.parts, self.client
@@ -167,14 +173,6 @@ class MultiLock:
             client.seen_stamp_ns,
             len(parts) == 1 and not self.plan.views,
             peer.successions,
-        )
-
-    def _view(self, shard: str, cut: Cut, now_ns: int) -> Request:
-        client, map_version = self.client, self.plan.placement.version
-        count = client.sendings.next(now_ns)
-        epoch, seen_ns = client.epoch(shard), client.seen_stamp_ns
-        return TakeView(
-            self.lock, epoch, map_version, count, cut.items[shard], seen_ns, cut.at_ns, cut.strict
         )
 
     def take_farewells(self) -> list[tuple[str, Request]]:
@@ -379,6 +377,9 @@ class MultiLock:
     def _end(self, phase: Phase) -> None:
         """Rest in `phase`; whatever may still be held or awaited is given back."""
         self.phase = phase
+        if self.keeping is not None and self.keeping.ends(phase, sent=self._finishing is not None):
+            self.client.ended(self)
+            return
         if self._finishing is not None:
             self._finishing.writes = {}  # they may be large, and the program may keep the lock
         if phase not in (Phase.COMMITTED, Phase.UNKNOWN):
@@ -421,6 +422,13 @@ class MultiLock:
         self.phase = Phase.VALIDATING
         self._after_votes()
 
+    def finish_kept(self, now_ns: int) -> bool:
+        """End without writes and without a message; False if the shard has to be asked."""
+        local = self.keeping is not None and self.keeping.begun_ns > 0 and self.valid(now_ns)
+        if local:
+            self._end(Phase.COMMITTED)
+        return local
+
     def shard_of(self, slot: Slot) -> str:
         """Return the shard where this lock has a slot, even if the placement changes meanwhile."""
         return shard_of(slot.entity, self.plan.placement)
@@ -449,6 +457,8 @@ class MultiLock:
             if isinstance(answer, Prepared):
                 self._finishing.prepared[shard] = answer
                 self.client.saw_stamp(answer.stamp_ns)
+            elif self.keeping is not None:
+                self.keeping.told(answer.kept, self)
             self._after_votes()
         elif isinstance(answer, Fenced):
             self.lose(answer.cause)
@@ -463,6 +473,8 @@ class MultiLock:
 
     def _on_committing(self, answer: Answer, now_ns: int) -> None:
         if isinstance(answer, Committed):
+            if self.keeping is not None:
+                self.keeping.told(answer.kept, self)
             self._committed(answer.position, answer.versions)
         elif isinstance(answer, Fenced):
             self.cause = answer.cause
@@ -475,24 +487,24 @@ class MultiLock:
     def _on_outcome(self, answer: OutcomeIs, now_ns: int) -> None:
         finishing = self._finishing
         assert finishing is not None
+        if self.keeping is not None:
+            self.keeping.grant = None
         if answer.kind == OUTCOME_COMMITTED:
             self._committed(answer.position, answer.versions)
-        elif answer.kind == OUTCOME_PENDING:
-            finishing.pending = True
+            return
+        phase, self.cause = finishing.not_committed(answer, self.cause)
+        if phase is not None:
+            self._end(phase)
+        elif finishing.pending:
             self._pause(now_ns)
-        elif answer.kind == OUTCOME_EXPIRED:
-            self.cause = "its shard has no record of this session any more"
-            self._end(Phase.UNKNOWN)
-        elif answer.epoch == finishing.token.epoch:
-            finishing.ask_outcome = False  # it never arrived: send it (again)
-        else:
-            self.cause = f"{SHARD_RESTARTED} before the commit arrived"
-            self._end(Phase.LOST)
 
     def _committed(self, position: Position, versions: tuple[SlotVersion, ...]) -> None:
         assert self._finishing is not None
         self.position, self.versions = position, versions
         self.client.saw_stamp(position.stamp_ns)
+        if self.keeping is not None and self.keeping.grant is not None:
+            writes = self._finishing.writes[self._finishing.primary]
+            self.keeping.grant.committed(writes, versions, position.stamp_ns)
         if prepared := self._finishing.prepared:
             self.versions += tuple([v for vote in prepared.values() for v in vote.versions])
             self.client.committed(prepared, position.stamp_ns)

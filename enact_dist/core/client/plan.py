@@ -95,6 +95,7 @@ class Plan:
     that lies not before `floor_ns`, nor before anything that the locks show; views of the past lie
     at `past_ns`.  `placement` is what the lock was placed by, to its end: the client may learn
     another meanwhile, and a shard refuses what was placed by any other than its own.
+    `keepable` says that its grant may stay with the session (`core.state.tenure.is_keepable`).
     """
 
     locks: tuple[tuple[str, tuple[Item, ...]], ...]
@@ -102,3 +103,4 @@ class Plan:
     placement: PlacementMap
     floor_ns: int = 0
     past_ns: int = 0
+    keepable: bool = False

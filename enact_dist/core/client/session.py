@@ -14,6 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
+from enact_dist.core.client.kept import KeptGrants
 from enact_dist.core.client.lease_clock import Sendings
 from enact_dist.core.client.own_commits import Unsettled
 from enact_dist.core.client.plan import Phase
@@ -75,6 +76,7 @@ class ClientSession(Generic[L]):
 
     Attributes:
         greeted: The shards that know that this client is in their epoch.
+        kept: The grants that stay here between two locks of the same data.
         peers: What is known of each shard that was met.
     """
 
@@ -84,6 +86,7 @@ class ClientSession(Generic[L]):
         "actor",
         "greeted",
         "host",
+        "kept",
         "observer",
         "peers",
         "pid",
@@ -118,6 +121,7 @@ class ClientSession(Generic[L]):
         self._seqs: dict[int, int] = {}
         self.greeted: set[str] = set()
         self.unsettled = Unsettled()
+        self.kept = KeptGrants()
 
     # ---------------------------------------------------------------- shards
 
@@ -203,12 +207,15 @@ class ClientSession(Generic[L]):
         self._enters(shard, epoch, acknowledged=False)
 
     def _drop_grants(self, shard: str) -> None:
+        self.kept.drop(shard)
         for lock in list(self._locks.values()):
             if any(part.shard == shard and part.token is not None for part in lock.parts):
                 lock.lose_at(shard, f"shard {shard} restarted or forgot this session")
 
     def learn_placement(self, placement: PlacementMap) -> None:
         """Take over the shard's placement map; where shards differ, the newest answer counts."""
+        if placement != self.placement:
+            self.kept.by_items.clear()
         self.placement = placement
 
     def saw_stamp(self, stamp_ns: int) -> None:
@@ -250,15 +257,17 @@ class ClientSession(Generic[L]):
         if answer.epoch != self.epoch(shard):
             return
         self.saw_stamp(answer.stamp_ns)
-        left = {grant.lock: grant for grant in answer.grants}
+        left = {grant.token: grant for grant in answer.grants}
         believe = self.sendings.believe_until_ns
+        until_ns = believe(answer.count_seen, self.ttl_ns)
+        self.kept.alive(shard, left, asked=request.count, until_ns=until_ns)
         for lock in list(self._locks.values()):
             for part in lock.parts:
                 if part.shard != shard or part.token is None:
                     continue
-                grant = left.get(lock.lock)
-                if grant is not None and grant.token == part.token:
-                    part.until_ns = max(part.until_ns, believe(answer.count_seen, self.ttl_ns))
+                grant = left.get(part.token)
+                if grant is not None:
+                    part.until_ns = max(part.until_ns, until_ns)
                     part.hold_until_ns = max(
                         part.hold_until_ns, believe(answer.count_seen, grant.hold_left_ns)
                     )

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from enact_dist.core.protocol.datum import Datum, LockId, Position, Slot, Token, message
 from enact_dist.core.protocol.parts import (
+    NOT_KEPT,
     START,
     AspectEntry,
     AuditEntry,
@@ -138,11 +139,16 @@ class Alive:
 
 @message
 class Committed:
-    """All writes of the lock are visible."""
+    """All writes of the lock are visible.
+
+    `kept` says whether the grant is over (`NOT_KEPT`, `PROVE`) or stays with the session: then it
+    is `PLACES` plus the cell of its session's page that holds its number as long as it lives.
+    """
 
     lock: LockId
     position: Position
     versions: tuple[SlotVersion, ...]
+    kept: int = NOT_KEPT
 
 
 @message
@@ -232,9 +238,10 @@ OUTCOME_EXPIRED = "expired"
 
 @message
 class Valid:
-    """The lock was held without interruption until now; it is released."""
+    """The lock was held without interruption until now.  It is released, or `kept`: `Committed`."""
 
     lock: LockId
+    kept: int = NOT_KEPT
 
 
 @message

@@ -69,7 +69,11 @@ class SlotState(NamedTuple):
 
 
 class Holder(NamedTuple):
-    """The holder or waiter of a lock, for messages to people."""
+    """The holder or waiter of a lock, for messages to people.
+
+    `kept` says of a grant that stays with its session between two blocks how it is used: "unused",
+    "used", or "recalled" (in use, while somebody waits); "" of any other.
+    """
 
     lock: LockId
     number: int
@@ -83,6 +87,7 @@ class Holder(NamedTuple):
     hold_left_ns: int
     slots: tuple[str, ...]
     waits_for: tuple[int, ...]
+    kept: str = ""
 
 
 class WriteItem(NamedTuple):
@@ -182,6 +187,16 @@ class GrantLeft(NamedTuple):
     lock: LockId
     token: Token
     hold_left_ns: int
+
+
+NOT_KEPT: Final = 0
+"""What is told of a grant that is over."""
+PROVE: Final = 1
+"""It is over, too, and the client shall first lock byte 0 of its page, which proves that the shard
+sees the locks of this client's files."""
+PLACES: Final = 2
+"""From here on: the grant stays with its session, and its number stands in the cell of this number
+less `PLACES`."""
 
 
 class AspectEntry(NamedTuple):

@@ -132,6 +132,8 @@ class Commit:
     Where other shards have prepared writes, they are the `participants`, and the record of this
     commit decides for them too; it is then forced to the disk, whatever its own data survive.
     `reads` and `reads_left_out` are the lineage of the writes (see `Cause`).
+    `keep` asks to keep the grant (see `Committed`).  Under a kept grant, which `token` names,
+    `lock` is a later lock of the session, held for `held_ns` as its client knows.
     """
 
     lock: LockId
@@ -142,6 +144,8 @@ class Commit:
     participants: tuple[str, ...] = ()
     reads: tuple[DatumRead, ...] = ()
     reads_left_out: int = 0
+    keep: bool = False
+    held_ns: int = 0
 
 
 @message
@@ -172,12 +176,13 @@ class Validate:
     """Is this lock still held, without interruption?  If so, release it.
 
     Answer: `Valid`, `Fenced` or `Changed`.  A token with number 0 stands for a shard where the lock
-    holds nothing but expects something.
+    holds nothing but expects something.  `keep` is that of `Commit`.
     """
 
     lock: LockId
     token: Token
     expects: tuple[SlotVersion, ...] = ()
+    keep: bool = False
 
 
 @message

@@ -21,8 +21,8 @@ from enact_dist.core.protocol.messages import (
 )
 from enact_dist.core.protocol.records import Effect, Reply
 from enact_dist.core.shard import owners
-from enact_dist.core.state.grants import Shape, shape_of
 from enact_dist.core.state.sessions import LANES_MAX, Lane, SessionState
+from enact_dist.core.state.tenure import Shape, shape_of
 from enact_dist.terms import ACCESSES
 
 if TYPE_CHECKING:
@@ -80,6 +80,8 @@ class LockDesk:
             tenure = tenures.enqueue(
                 message, shape, session, now_ns=state.now_ns, at_once=state.grants
             )
+            if tenure.token is None and tenures.kept.by_number:
+                tenures.recall_for(tenure, now_ns=state.now_ns)
             if tenures.table.ready:
                 effects += state.grant_ready()
         if tenure.token is not None:
@@ -145,7 +147,7 @@ class LockDesk:
         """A newer lock of a lane ends the older ones: their release was lost."""
         for tenure in self._state.tenures.of_session(lock.session):
             older = tenure.lock.lane == lock.lane and tenure.lock.seq < lock.seq
-            if older and not tenure.bound:
+            if older and not tenure.bound and not tenure.kept:
                 self._state.count("superseded")
                 yield from self._state.tenures.take_away(
                     tenure, "a newer lock of its thread", now_ns=self._state.now_ns
@@ -247,6 +249,10 @@ class LockDesk:
             effects += state.tenures.remove(tenure, now_ns=state.now_ns)
         elif tenure is not None:
             self._prepares.hint(lock)
+        elif state.tenures.kept.has(lock.session):
+            lane = state.sessions.by_id[lock.session].lanes.get(lock.lane)
+            if lane is not None and lane.top < lock.seq:
+                lane.top = lock.seq  # a late copy of its commit under a kept grant is fenced
         if lock.session in state.pins.by_session:
             state.pins.drop(lock)
         effects += (Reply(reply_to, Released()),)

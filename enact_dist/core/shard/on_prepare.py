@@ -67,7 +67,7 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.messages import Cause
     from enact_dist.core.protocol.records import ShardReturned
     from enact_dist.core.shard.state import ShardState
-    from enact_dist.core.state.grants import Tenure
+    from enact_dist.core.state.tenure import Tenure
 
 ASK_NS_MAX: Final = 1_000_000_000
 """A prepared lock asks its primary at least so often (TTL / 2 of its session where shorter)."""

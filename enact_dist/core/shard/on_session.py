@@ -210,7 +210,8 @@ class SessionDesk:
             session.report = message.report if len(message.report) <= REPORT_BYTES_MAX else b""
         lowest = {view.lane: view.seq for view in message.view}
         for tenure in self._state.tenures.of_session(message.session):
-            if tenure.lock.seq < lowest.get(tenure.lock.lane, 0) and not tenure.bound:
+            unwanted = tenure.lock.seq < lowest.get(tenure.lock.lane, 0)
+            if unwanted and not (tenure.bound or tenure.kept):
                 self._state.count("orphans_freed")
                 told = self._state.tenures.told(tenure, self._state.now_ns)
                 yield Story("lock.orphan", f"{told}, freed: its client no longer wants it")
@@ -262,6 +263,7 @@ class SessionDesk:
         self._state.pins.drop_session(session)
         self._state.sessions.forget(session)
         self._state.tenures.session_ended(session)
+        self._state.tenures.kept.session_ended(session)
         self._state.sessions.end_grace_if_all_acknowledged(self._state.now_ns)
         recording = self._recording.pop(session, None)
         if found.durable or recording is not None:

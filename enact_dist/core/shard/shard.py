@@ -93,6 +93,11 @@ _DECIDE: Final = frozenset((Persisted, Called, Drain))
 """After these, what was undecided may be decided; without a store after any message."""
 
 
+LOOK_AGAIN_NS: Final = 20_000_000
+"""How soon a shard looks again whether a recalled grant is still in use: word of its end may be
+lost, with a client that was interrupted."""
+
+
 class Shard:
     """The whole state of one shard.  See the module docstring for the rules."""
 
@@ -235,6 +240,8 @@ class Shard:
         now_ns = self.state.now_ns
         at_latest_ns = now_ns + self.state.shortest_ttl_ns // 8
         deadlines = [at_latest_ns]
+        if self.state.tenures.kept.recalled:
+            deadlines.append(now_ns + LOOK_AGAIN_NS)
         if self.state.sessions.in_grace(now_ns):
             deadlines.append(self.state.sessions.grace_end_ns)
         state = self.state
@@ -310,6 +317,7 @@ class Shard:
         now_ns = self.state.now_ns
         for session in self.state.tenures.leases_over(now_ns):
             yield from self._expire(session)
+        self.state.tenures.kept.end_unused()
         for tenure in self.state.tenures.held_too_long(now_ns):
             self.state.count("held_too_long")
             cause = f"{HELD_TOO_LONG} {tenure.hold_ns / 1e9:g} s"
@@ -341,6 +349,10 @@ class Shard:
 
     def _on_drain(self, _: Drain, __: int) -> Iterator[Effect]:
         self.state.draining = True
+        tenures = self.state.tenures
+        tenures.kept.closed = True
+        for tenure in list(tenures.kept.by_number.values()):
+            tenures.recall(tenure, now_ns=self.state.now_ns)
         for tenure in list(self.state.tenures.by_lock.values()):
             if tenure.parked is not None:
                 yield self.state.tenures.waiting(tenure, self.state.now_ns)

@@ -25,7 +25,7 @@ from enact_dist.core.state.catalogue import Catalogue
 from enact_dist.core.state.clock import Stamps, newest_stamp
 from enact_dist.core.state.commits import Commits
 from enact_dist.core.state.decisions import Decisions
-from enact_dist.core.state.grants import Tenure, Tenures
+from enact_dist.core.state.grants import Tenures
 from enact_dist.core.state.sessions import LANES_MAX, SessionState, SessionTable
 from enact_dist.core.state.slots import SlotMap
 
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
         KeepVersions,
     )
     from enact_dist.core.protocol.records import Effect, Record, Recovered, Then
+    from enact_dist.core.state.tenure import Tenure
     from enact_dist.terms import Durability
 
     Pinned = dict[tuple[Slot, int], Datum]

@@ -67,8 +67,8 @@ from enact_dist.core.protocol.records import (
     SlotRecord,
     cause_bytes,
 )
-from enact_dist.core.state.grants import X
-from enact_dist.core.state.sessions import Lane
+from enact_dist.core.state.sessions import LANES_MAX, Lane
+from enact_dist.core.state.tenure import X
 from enact_dist.terms import Durability, NullReason
 
 if TYPE_CHECKING:
@@ -80,11 +80,10 @@ if TYPE_CHECKING:
     from enact_dist.core.state.catalogue import Catalogue
     from enact_dist.core.state.clock import Stamps
     from enact_dist.core.state.decisions import Decisions
-    from enact_dist.core.state.grants import Tenure, Tenures
+    from enact_dist.core.state.grants import Tenures
     from enact_dist.core.state.sessions import SessionTable
     from enact_dist.core.state.slots import SlotMap
-
-NOT_HELD: Final = "it is not held here (never granted, released, or forgotten)"
+    from enact_dist.core.state.tenure import Tenure
 
 _DELETED: Final = NullReason.DELETED
 _STRICTNESS: Final = (Durability.VOLATILE, Durability.OS, Durability.DURABLE)
@@ -99,6 +98,7 @@ class _InFlight:
     new: bool
     outcome: OutcomeRecord
     cause: Cause
+    keep: bool
     reply_to: list[int] = field(default_factory=list)
     decision: DecisionRecord | None = None
 
@@ -174,11 +174,12 @@ class Commits:
         recorded = self._recorded(lock)
         if recorded is not None:
             self._counters["commits_repeated"] += 1
-            return [Reply(reply_to, Committed(lock, recorded.position, recorded.versions))]
-        tenure = self._tenures.by_lock.get(lock)
-        if tenure is not None and tenure.committing and lock in self._in_flight:
+            kept = self._tenures.kept.told(lock, message.token)
+            return [Reply(reply_to, Committed(lock, recorded.position, recorded.versions, kept))]
+        if lock in self._in_flight:
             self._in_flight[lock].reply_to.append(reply_to)
             return []
+        tenure = self._tenures.find(lock, message.token)
         new = not self._slots.exist(message.writes)
         refusal = self.refusal(message, tenure, new=new, wall_ns=wall_ns)
         if refusal is not None:
@@ -192,8 +193,12 @@ class Commits:
         versions = tuple([SlotVersion(slot, next_version(slot)) for slot, _ in message.writes])
         outcome = OutcomeRecord(lock, Position(stamp_ns, self._shard), versions)
         session = self._sessions.by_id[lock.session]
-        cause = session.cause(message, versions, stamp_ns, now_ns - tenure.granted_ns)
-        commit = _InFlight(tenure, message.writes, new, outcome, cause, [reply_to])
+        held_ns = now_ns - tenure.granted_ns
+        if tenure.kept:
+            session.lane(lock.lane).top = lock.seq
+            held_ns = min(held_ns, message.held_ns)
+        cause = session.cause(message, versions, stamp_ns, held_ns)
+        commit = _InFlight(tenure, message.writes, new, outcome, cause, message.keep, [reply_to])
         if message.participants:
             commit.decision = DecisionRecord(lock, outcome.position, message.participants)
         return self._make_durable(commit, now_ns=now_ns)
@@ -293,7 +298,7 @@ class Commits:
         return self._apply(commit, now_ns=now_ns)
 
     def _apply(self, commit: _InFlight, *, now_ns: int) -> Iterable[Effect]:
-        lock, outcome = commit.tenure.lock, commit.outcome
+        lock, outcome = commit.outcome.lock, commit.outcome
         stamp_ns = outcome.position.stamp_ns
         changes = self.apply_writes(commit.writes, outcome.versions, stamp_ns, commit.cause)
         session = self._sessions.by_id.get(lock.session)
@@ -305,10 +310,10 @@ class Commits:
             # A commit whose client gave up may end after a newer one of its lane.
             if lane.outcome is None or lane.outcome.lock.seq < lock.seq:
                 lane.outcome = outcome
-        effects: list[Effect] = []
-        effects += self._tenures.remove(commit.tenure, now_ns=now_ns)
+        kept, ended = self._tenures.end_block(commit.tenure, keep=commit.keep, now_ns=now_ns)
+        effects: list[Effect] = [*ended]
         self._counters["commits"] += 1
-        committed = Committed(lock, outcome.position, outcome.versions)
+        committed = Committed(lock, outcome.position, outcome.versions, kept)
         for reply_to in commit.reply_to:
             effects += (Reply(reply_to, committed),)
         effects += self.publish(changes)
@@ -410,8 +415,8 @@ class Commits:
 
     def _fence(
         self, lock: LockId, token: Token, tenure: Tenure | None
-    ) -> Fenced | Changed | EpochChanged | None:
-        """Return None only if exactly this grant is live."""
+    ) -> Fenced | Changed | EpochChanged | Refused | None:
+        """Return None only if exactly this grant is live, and this lock is its newest."""
         session = self._sessions.by_id.get(lock.session)
         if token.epoch != self._epoch or session is None or not session.present:
             self._counters["epoch_refusals"] += 1
@@ -420,15 +425,14 @@ class Commits:
             lane = session.lanes.get(lock.lane)
             if lane is not None and lane.changed is not None and lane.changed.lock == lock:
                 return lane.changed
-            self._counters["fenced"] += 1
-            return Fenced(lock, self._cause(lock))
+            return self._tenures.fenced(lock, token)
+        if tenure.kept:
+            lane = session.lanes.get(lock.lane)
+            if lane is not None and lock.seq <= lane.top:  # late: what it was built on may be gone
+                return self._tenures.fenced(lock, token)
+            if lane is None and len(session.lanes) >= LANES_MAX:
+                return Refused("overload", f"{LANES_MAX} lanes in one session")
         return None
-
-    def _cause(self, lock: LockId) -> str:
-        session = self._sessions.known(lock.session)
-        lane = session.lanes.get(lock.lane) if session is not None else None
-        ended = lane.ended if lane is not None else None
-        return ended[1] if ended is not None and ended[0] == lock else NOT_HELD
 
     # ---------------------------------------------------------------- validate, outcome
 
@@ -440,21 +444,22 @@ class Commits:
         session = self._sessions.known(lock.session)
         lane = session.lanes.get(lock.lane) if session is not None else None
         if lane is not None and lane.validated == (lock, token):
-            return [Reply(reply_to, Valid(lock))]
-        tenure = self._tenures.by_lock.get(lock)
+            return [Reply(reply_to, Valid(lock, self._tenures.kept.told(lock, token)))]
+        tenure = self._tenures.find(lock, token)
         fenced = self._fence(lock, token, tenure)
         if fenced is not None or tenure is None or tenure.bound:
-            return [Reply(reply_to, fenced or Fenced(lock, NOT_HELD))]
+            return [Reply(reply_to, fenced or self._tenures.fenced(lock, token))]
         assert session is not None
         moved = self.moved_on(message.expects, lock) if message.expects else None
         if moved is not None:
             return self.changed(tenure, moved, reply_to=reply_to, now_ns=now_ns)
-        session.lane(lock.lane).validated = (lock, token)
-        effects: list[Effect] = []
-        effects += self._tenures.remove(tenure, now_ns=now_ns)
+        lane = session.lane(lock.lane)
+        lane.validated = (lock, token)
+        if tenure.kept:
+            lane.top = lock.seq
+        kept, ended = self._tenures.end_block(tenure, keep=message.keep, now_ns=now_ns)
         self._counters["locks_validated"] += 1
-        effects += (Reply(reply_to, Valid(lock)),)
-        return effects
+        return [*ended, Reply(reply_to, Valid(lock, kept))]
 
     def _expected(self, message: Validate) -> Valid | Changed | EpochChanged:
         """Compare the expectations of a lock that holds nothing here."""
@@ -474,7 +479,7 @@ class Commits:
         nothing = Position(0, self._shard)
         if recorded is not None:
             kind, position, versions = OUTCOME_COMMITTED, recorded.position, recorded.versions
-        elif tenure is not None and tenure.committing:
+        elif message.lock in self._in_flight or (tenure is not None and tenure.committing):
             kind, position, versions = OUTCOME_PENDING, nothing, ()
         else:
             lanes = self._sessions.lanes_of(message.lock.session)

@@ -20,18 +20,25 @@ from __future__ import annotations
 
 import heapq
 from collections import Counter
-from dataclasses import dataclass, field
 from itertools import islice
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.protocol.datum import Column, Datum, LockId, Slot, Token
-from enact_dist.core.protocol.messages import Acquire, Granted, Holder, Item, Waiting
+from enact_dist.core.protocol.datum import LockId, Token
+from enact_dist.core.protocol.messages import (
+    NOT_KEPT,
+    PLACES,
+    Acquire,
+    Fenced,
+    Granted,
+    Holder,
+    Item,
+    Waiting,
+)
 from enact_dist.core.protocol.records import Effect, Reply, Story
 from enact_dist.core.state.clock import DueTimes, Latencies
-from enact_dist.core.state.lock_table import Claim, LockTable, Mode, Resource, join
+from enact_dist.core.state.lock_table import LockTable, Mode
 from enact_dist.core.state.slots import SlotMap
-from enact_dist.patterns import pattern_matches
-from enact_dist.terms import ACCESSES, Access
+from enact_dist.core.state.tenure import KeptGrants, Shape, Tenure, shape_of, wants_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -43,6 +50,7 @@ WAIT_SLICE_NS_MAX: Final = 1_000_000_000
 """Longest time one request is parked; a client that still waits asks again (long poll)."""
 HOLD_NS_MAX: Final = 24 * 3600 * 1_000_000_000
 """A lock is held for a day at most; then the client must request it again."""
+NOT_HELD: Final = "it is not held here (never granted, released, or forgotten)"
 HELD_TOO_LONG: Final = "held longer than its limit of"
 """So begins the cause of a lock that ends by its hold limit."""
 STALE_ENDS_MAX: Final = 1024
@@ -55,95 +63,10 @@ BLOCKERS_TOLD_MAX: Final = 8
 """How many of the locks ahead of it a waiter learns of."""
 
 
-@dataclass(slots=True, eq=False)
-class Tenure:
-    """One lock at this shard.
-
-    Attributes:
-        named: The slots of `items` where none of these is a pattern.
-        alone: It holds and views nothing at other shards: its commit decides in one step.
-        committing: The store works on its commit, its preparation or its end.
-        prepared: What another shard decides about.
-        owner: The identity of its session (see `core.shard.owners`).
-    """
-
-    lock: LockId
-    claim: Claim
-    items: tuple[Item, ...]
-    hold_ns: int
-    asked_ns: int
-    named: tuple[Slot, ...] = ()
-    alone: bool = False
-    token: Token | None = None
-    granted_ns: int = 0
-    hold_end_ns: int = 0
-    committing: bool = False
-    prepared: PreparedRecord | None = None
-    parked: int | None = None
-    owner: str = ""
-    pins: dict[tuple[Slot, int], Datum] = field(default_factory=dict)
-
-    @property
-    def bound(self) -> bool:
-        """Whether neither its client nor time can end it."""
-        return self.committing or self.prepared is not None
-
-    def covers(self, slot: Slot) -> bool:
-        """Whether this lock may write `slot`."""
-        if self.claim.wants.get(slot) is X:
-            return True
-        return any(
-            item.access == Access.WRITE_EACH
-            and (item.context, item.aspect) == (slot.context, slot.aspect)
-            and pattern_matches(item.entity, slot.entity)
-            for item in self.items
-        )
-
-
 _WORDS: Final = {Mode.S: "read", Mode.X: "write", Mode.SIX: "read all, write some"}
-_IS, _IX, _S, X = Mode.IS, Mode.IX, Mode.S, Mode.X
 SHAPE_ITEMS_MAX: Final = 32
 SHAPES_MAX: Final = 256
 """Sets of so few requested items, at most so many, that are remembered."""
-
-
-@dataclass(slots=True, eq=False)
-class Shape:
-    """What follows from a set of requested items alone.
-
-    Attributes:
-        wants: Which resources they use, and how.
-        named: Their slots where none of them is a pattern, else none.
-        patterns: How many are patterns.
-    """
-
-    wants: dict[Resource, Mode]
-    named: tuple[Slot, ...]
-    patterns: int
-
-
-def wants_of(items: Iterable[Item]) -> dict[Resource, Mode]:
-    """Return which resources a set of requested items uses, and how."""
-    wants: dict[Resource, Mode] = {}
-    for item in items:
-        access = ACCESSES[item.access]
-        if not access.locks:
-            continue
-        column = Column(item.context, item.aspect)
-        if access.each:
-            wants[column] = join(wants.get(column), X if access.writes else _S)
-        else:
-            slot = Slot(item.context, item.entity, item.aspect)
-            wants[slot] = join(wants.get(slot), X if access.writes else _S)
-            wants[column] = join(wants.get(column), _IX if access.writes else _IS)
-    return wants
-
-
-def shape_of(items: tuple[Item, ...]) -> Shape:
-    """Return what follows from a set of requested items alone."""
-    patterns = sum(ACCESSES[item.access].each for item in items)
-    named = () if patterns else tuple([Slot(i.context, i.entity, i.aspect) for i in items])
-    return Shape(wants_of(items), named, patterns)
 
 
 class Tenures:
@@ -152,6 +75,7 @@ class Tenures:
     Attributes:
         shapes: The sets of items that were requested lately, all without a fault.
         waiting_of: How many requests the waiting locks of each identity have.
+        kept: The grants that stay with their sessions between two blocks.
         waited: How long locks were in the queue until their grant.
     """
 
@@ -167,6 +91,7 @@ class Tenures:
         "by_lock",
         "by_session",
         "counters",
+        "kept",
         "shapes",
         "table",
         "waited",
@@ -190,6 +115,7 @@ class Tenures:
         self.by_lock: dict[LockId, Tenure] = {}
         self.by_session: dict[str, dict[LockId, Tenure]] = {}
         self.counters = counters
+        self.kept = KeptGrants(counters, lambda tenure: self.remove(tenure, now_ns=0))
         self.waited = Latencies()
 
     def of_session(self, session: str) -> list[Tenure]:
@@ -211,7 +137,8 @@ class Tenures:
         claim = self.table.enqueue(lock, shape.wants, at_once=at_once)
         if hold_ns > HOLD_NS_MAX:  # noqa: PLR1730 - as in `Stamps.next`
             hold_ns = HOLD_NS_MAX
-        tenure = Tenure(lock, claim, items, hold_ns, now_ns, shape.named, message.alone)
+        keepable = message.alone and shape.keepable
+        tenure = Tenure(lock, claim, items, hold_ns, now_ns, shape.named, message.alone, keepable)
         self._add(tenure, session)
         if claim.granted:
             self._begin(tenure, now_ns=now_ns)
@@ -360,9 +287,54 @@ class Tenures:
             from_ns,
         )
 
+    def find(self, lock: LockId, token: Token) -> Tenure | None:
+        """Return the tenure that a message is about: of its lock, or kept under its token."""
+        return self.by_lock.get(lock) or self.kept.find(lock, token)
+
+    def fenced(self, lock: LockId, token: Token) -> Fenced:
+        """Refuse a lock that is not held, with the cause as far as it is known."""
+        self.counters["fenced"] += 1
+        session = self._sessions.known(lock.session)
+        lane = session.lanes.get(lock.lane) if session is not None else None
+        ended = lane.ended if lane is not None else None
+        cause = ended[1] if ended is not None and ended[0] == lock else None
+        return Fenced(lock, cause or self.kept.cause(token) or NOT_HELD)
+
+    def recall_for(self, waiter: Tenure, *, now_ns: int) -> None:
+        """Recall the kept grants in the way of a waiter; those that no block uses are over."""
+        for claim in self.table.holders_against(waiter.claim):
+            self.recall(self.by_lock[claim.lock], now_ns=now_ns)
+
+    def recall(self, tenure: Tenure, *, now_ns: int) -> None:
+        """Take a grant back if it is kept; the hold limit of a block that uses it begins."""
+        if tenure.kept and not tenure.recalled and not self.kept.recall(tenure):
+            tenure.hold_end_ns = now_ns + tenure.hold_ns
+            heapq.heappush(self._hold_ends, (tenure.hold_end_ns, tenure.lock))
+
+    def end_block(self, tenure: Tenure, *, keep: bool, now_ns: int) -> tuple[int, Iterable[Effect]]:
+        """End a block that ended well: its grant stays, or is over.
+
+        Args:
+            tenure: The grant.
+            keep: Whether the client asks to keep it.
+            now_ns: The present.
+
+        Returns:
+            What the client is told (see `Committed`), and the answers to others.
+        """
+        told = NOT_KEPT
+        if keep and tenure.keepable:
+            told = self.kept.stays(tenure, awaited=self.table.awaited(tenure.claim))
+        if told < PLACES:
+            return told, self.remove(tenure, now_ns=now_ns)
+        tenure.pins.clear()
+        return told, ()
+
     def remove(self, tenure: Tenure, *, now_ns: int) -> Iterable[Effect]:
         """End a tenure; who waited for it becomes ready (see `grant_ready`)."""
         answers = [] if tenure.parked is None else [self.waiting(tenure, now_ns)]
+        if tenure.kept:
+            self.kept.over(tenure)
         if tenure.token is None:
             self._count_waiting(tenure, -1)
         lock = tenure.lock
@@ -381,6 +353,8 @@ class Tenures:
         session = self._sessions.by_id.get(tenure.lock.session)
         if session is not None and tenure.token is not None:
             session.lane(tenure.lock.lane).ended = (tenure.lock, cause)
+        if tenure.kept:
+            self.kept.taken(tenure, cause)
         yield Story("lock.taken", f"{self.told(tenure, now_ns)}: {cause}")
         yield from self.remove(tenure, now_ns=now_ns)
 
@@ -411,7 +385,15 @@ class Tenures:
             max(0, tenure.hold_end_ns - now_ns) if granted else tenure.hold_ns,
             tuple(islice(named, SLOTS_TOLD_MAX)),
             tuple(claim.ticket for claim in waits_for),
+            self._use(tenure),
         )
+
+    def _use(self, tenure: Tenure) -> str:
+        """Return how a kept grant is used now; "" for one that is not kept."""
+        if not tenure.kept or tenure.token is None:
+            return ""
+        used = self.kept.marks.used(tenure.lock.session, tenure.token.number)
+        return "recalled" if tenure.recalled else "used" if used else "unused"
 
     def told(self, tenure: Tenure, now_ns: int) -> str:
         """Return a lock as the log names it: whose it is, and of what."""
@@ -435,6 +417,8 @@ class Tenures:
             tenure = self.by_lock.get(lock)
             if tenure is None or tenure.token is None or tenure.bound:
                 continue
+            if tenure.kept and not tenure.recalled:
+                continue  # nobody waits for it; its hold limit begins when it is recalled
             if tenure.hold_end_ns > now_ns:
                 heapq.heappush(self._hold_ends, (tenure.hold_end_ns, lock))
             else:
@@ -467,6 +451,7 @@ class Tenures:
     def assert_invariants(self) -> None:
         """Assert I1, I8 and the bookkeeping over all tenures.  For tests and simulation."""
         self.table.assert_invariants()
+        self.kept.assert_invariants(self.by_lock)
         assert self.by_lock.keys() == self.table.claims.keys()
         waiting = Counter[str]()
         for tenure in self.by_lock.values():

@@ -259,6 +259,25 @@ class LockTable:
                     self._spare.append(queue)
         return claim
 
+    def awaited(self, claim: Claim) -> bool:
+        """Whether somebody waits for what a granted claim holds."""
+        for resource, mode in claim.wants.items():
+            queue = self._queues[resource]
+            if queue.waiters and any(queue.waiting[other] for other in CONFLICTS[mode]):
+                return True
+        return False
+
+    def holders_against(self, claim: Claim) -> list[Claim]:
+        """Return the granted claims that a waiting one has to wait for."""
+        found: dict[LockId, Claim] = {}
+        for resource, mode in claim.wants.items():
+            queue = self._queues[resource]
+            if any(queue.held_modes[other] for other in CONFLICTS[mode]):
+                for lock, held in queue.held.items():
+                    if held in CONFLICTS[mode]:
+                        found[lock] = self.claims[lock]
+        return list(found.values())
+
     def writers_of(self, slot: Slot) -> list[LockId]:
         """Return the holder that may write a slot, alone or with its whole column."""
         found: list[LockId] = []

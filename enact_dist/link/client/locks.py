@@ -17,12 +17,14 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.client.backoff import CALLED_NS_MAX, CALLED_NS_MIN, Backoff
+from enact_dist.core.client.kept import Keeping
 from enact_dist.core.client.lock import MultiLock
 from enact_dist.core.client.plan import Phase
 from enact_dist.core.protocol.messages import (
     OUTCOME_COMMITTED,
     OUTCOME_PENDING,
     OUTCOME_UNSEEN,
+    PROVE,
     Commit,
     Explain,
     Outcome,
@@ -77,6 +79,7 @@ class CellClient(SessionClient):
         interrupt: threading.Event | None = None,
         begun: list[MultiLock] | None = None,
         past_ns: int = 0,
+        keep: tuple[Item, ...] = (),
     ) -> MultiLock:
         """Acquire a lock; it rests in HELD when this returns.
 
@@ -88,6 +91,8 @@ class CellClient(SessionClient):
             begun: Receives the lock before the first request, so that its caller can release it if
                 an exception comes between the return and the assignment.
             past_ns: All items are views, as of this timestamp.
+            keep: The requests under which this session may keep the grant for the next lock of
+                them; empty: it may not.
 
         Raises:
             LockTimeoutError: Not granted in time; nothing is held.
@@ -109,6 +114,10 @@ class CellClient(SessionClient):
         except IndexError:
             lane = self._lanes.take()
         try:
+            if keep and keep in core.kept.by_items and not (interrupt and interrupt.is_set()):
+                kept = self._begin_kept(lane, keep, int(hold_s * 1e9), begun)
+                if kept is not None:
+                    return kept
             for attempt in itertools.count():
                 with self._mutex:
                     plan = core.plan(items, lock_views=lock_views, past_ns=past_ns)
@@ -116,6 +125,8 @@ class CellClient(SessionClient):
                     wait_ns, hold_ns = max(0, give_up_ns - now_ns), int(hold_s * 1e9)
                     lock = core.begin(lane, plan, now_ns=now_ns, wait_ns=wait_ns, hold_ns=hold_ns)
                     begun.append(lock)
+                    if keep and plan.keepable and self.payloads.keeps(plan.locks[0][0]):
+                        lock.keeping = Keeping(keep)
                     for before in begun[-2:-1]:
                         before.lane_free = True  # the next lock takes over the lane
                 if interrupt is not None:
@@ -138,6 +149,46 @@ class CellClient(SessionClient):
             else:
                 self._lanes.give_back(lane)
             raise
+
+    def _begin_kept(
+        self, lane: int, items: tuple[Item, ...], hold_ns: int, begun: list[MultiLock]
+    ) -> MultiLock | None:
+        """Begin a lock under a grant that this session has kept; None if it has to be asked for."""
+        grant = self.core.kept.take(items)
+        if grant is None:
+            return None
+        page = self.payloads.page(grant.shard, grant.token.epoch)
+        if page is None:
+            return None
+        lock, number = None, grant.token.number
+        page.mark(number)
+        try:
+            if page.lives(grant.place, number):
+                with self._mutex:
+                    lock = self.core.begin_kept(lane, grant, now_ns=self._now_ns(), hold_ns=hold_ns)
+                    if lock is not None:
+                        begun.append(lock)
+        finally:
+            if lock is None:
+                page.unmark(number)
+        return lock
+
+    def _leave_kept(self, lock: MultiLock, keeping: Keeping) -> None:
+        """Give the mark of a block back, and keep its grant if that still lives."""
+        part, grant = lock.parts[0], keeping.take_grant()
+        page = self.payloads.page(part.shard, part.token.epoch) if part.token else None
+        if part.token is None or page is None:
+            if keeping.said == PROVE:
+                self.payloads.prove(part.shard)
+            return
+        number = part.token.number
+        if keeping.begun_ns:
+            keeping.begun_ns = 0
+            page.unmark(number)
+        if grant is not None and page.lives(grant.place, number):
+            self.core.kept.put_back(grant)
+        elif grant is not None:
+            lock.farewells.append((part.shard, Release(grant.origin)))
 
     def _release_of(self, lane: int) -> None:
         """Release the lock of a lane, even one that an interrupt kept from being recorded.
@@ -274,6 +325,10 @@ class CellClient(SessionClient):
         started_ns = self._now_ns()
         named, size = writes, 0
         try:
+            if not writes and not expects and lock.keeping is not None:
+                with self._mutex:
+                    if lock.finish_kept(started_ns):
+                        return
             if writes and lock.phase is Phase.HELD:
                 size = sum(map(bytes_with, writes.values()))
                 if size > INLINE_BYTES_MAX:
@@ -367,6 +422,8 @@ class CellClient(SessionClient):
             if lock.phase is not Phase.COMMITTED:  # which only this thread can bring about
                 with self._mutex:
                     lock.release()
+            if lock.keeping is not None:
+                self._leave_kept(lock, lock.keeping)
             if lock.farewells:
                 self._say_farewell(lock)
         finally:

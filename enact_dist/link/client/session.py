@@ -75,6 +75,7 @@ _alive: weakref.WeakSet[SessionClient] = weakref.WeakSet()
 def _after_fork() -> None:
     for client in list(_alive):
         client.forked = True
+        client.payloads.leave_pages()
 
 
 os.register_at_fork(after_in_child=_after_fork)

@@ -32,6 +32,7 @@ from enact_dist.link.memory.maps import (
 )
 from enact_dist.link.memory.payload_desk import NO_ROOM
 from enact_dist.link.memory.shared_folder import OpenedFolder, open_shared
+from enact_dist.link.memory.use_marks import ClientPage, retains
 from enact_dist.link.refusals import error_of
 from enact_dist.wire.limits import DRAFT_NAME, PAYLOAD_BYTES_MIN
 
@@ -119,11 +120,13 @@ def _cut_off(pages: Pages, descriptor: int) -> None:
 class _Shared:
     """The shared folder of one start of a shard, if this process sees it."""
 
-    __slots__ = ("epoch", "folder", "name", "nonce")
+    __slots__ = ("epoch", "folder", "keeps", "name", "nonce", "page")
 
     def __init__(self, welcome: Welcome) -> None:
         self.name, self.nonce, self.epoch = welcome.shared, welcome.shared_nonce, welcome.epoch
         self.folder: OpenedFolder | None = None
+        self.page: ClientPage | None = None
+        self.keeps = False
 
     def __del__(self) -> None:
         if self.folder is not None:
@@ -167,6 +170,7 @@ class SharedPayloads:
             if shared.name:
                 try:
                     shared.folder = open_shared(shared.name, shared.nonce)
+                    shared.keeps = retains()
                 except EnactError as error:
                     self._count("payload_folders_elsewhere")
                     _log.info("shard %s: %s", welcome.shard, error)
@@ -174,6 +178,38 @@ class SharedPayloads:
     def _folder(self, shard: str) -> _Shared | None:
         shared = self._shards.get(shard)
         return shared if shared is not None and shared.folder is not None else None
+
+    # ---------------------------------------------------------------- kept grants
+
+    def keeps(self, shard: str) -> bool:
+        """Whether a shard may see which of its grants this session uses."""
+        shared = self._shards.get(shard)
+        return shared is not None and shared.keeps
+
+    def page(self, shard: str, epoch: int) -> ClientPage | None:
+        """Return this session's page of one start of a shard; None if there is none here."""
+        shared = self._shards.get(shard)
+        return shared.page if shared is not None and shared.epoch == epoch else None
+
+    def prove(self, shard: str) -> None:
+        """Open this session's page, as its shard has asked; without it, keep no grants there."""
+        with self._mutex:
+            shared = self._folder(shard)
+            if shared is None or shared.page is not None or shared.folder is None:
+                return
+            folder = shared.folder
+            try:
+                shared.page = ClientPage(folder.descriptor, folder.owner, self._session)
+            except OSError as error:
+                shared.keeps = False
+                self._count("pages_of_grants_failed")
+                _log.info("no grants of shard %s are kept: %s", shard, error)
+
+    def leave_pages(self) -> None:
+        """Close the pages that a forked child has inherited, without giving marks back."""
+        for shared in list(self._shards.values()):
+            if shared.page is not None:
+                shared.page.close()
 
     # ---------------------------------------------------------------- writing
 

@@ -10,7 +10,7 @@ from enact_dist.core.protocol.records import Tick
 from enact_dist.verify.simulation.judges.history import conflict
 
 if TYPE_CHECKING:
-    from enact_dist.core.state.grants import Tenure
+    from enact_dist.core.state.tenure import Tenure
     from enact_dist.verify.simulation.hosts.shard_host import ShardNode
     from enact_dist.verify.simulation.hosts.world import SimulatedWorld
     from enact_dist.verify.simulation.judges.picture import ShardPicture

@@ -1,0 +1,199 @@
+"""The pages through which client and shard of one host see the use of kept grants.
+
+A page is a file of the shard's shared folder, one per session.  Each of its cells holds the number
+of a grant that lives; a client that finds another number there knows that its grant is over.  That
+a block uses a grant is shown by a lock of the kernel on the byte of the same file whose offset is
+the grant's number: the kernel gives it up with the client's process, and asking for it never waits.
+(Locks of an open file description, `F_OFD_SETLK`: other locks would vanish whenever the process
+closes any descriptor of the file.)
+
+The client's lock on byte 0 proves to the shard that it sees the locks of this client.  A file
+system without such locks, or one whose locks end at a container's wall, never shows it, and no
+grant is kept.
+
+What a kernel call orders here: either side changes its own word first (mark or cell) and looks at
+the other's afterwards, and each change of a mark is a system call.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import logging
+import mmap
+import os
+import struct
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.core.protocol.messages import NOT_KEPT, PLACES, PROVE
+from enact_dist.core.state.tenure import KEPT_OF_SESSION_MAX
+
+if TYPE_CHECKING:
+    from enact_dist.link.memory.shared_folder import SharedFolder
+
+RETAIN_VARIABLE: Final = "ENACT_RETAIN"
+"""With the value 0 this process keeps no grants, as a client and as a shard."""
+_CELL: Final = struct.Struct("=Q")
+PAGE_BYTES: Final = KEPT_OF_SESSION_MAX * _CELL.size
+_LOCK: Final = struct.Struct("hhqqi4x")  # struct flock of 64-bit Linux
+_PROOF: Final = 0
+"""The byte that a client keeps locked."""
+
+_log = logging.getLogger("enact.link")
+
+
+def retains() -> bool:
+    """Whether this process keeps grants."""
+    return os.environ.get(RETAIN_VARIABLE, "") != "0"
+
+
+def page_name(session: str) -> str:
+    """Return the name of a session's page in the folder."""
+    return f"uses-{session}"
+
+
+class _ShardPage:
+    """One session's page, as the shard has it."""
+
+    __slots__ = ("cells", "descriptor", "free", "places", "proven")
+
+    def __init__(self, descriptor: int) -> None:
+        self.descriptor = descriptor
+        self.cells = mmap.mmap(descriptor, PAGE_BYTES)
+        self.places: dict[int, int] = {}
+        self.free = list(range(KEPT_OF_SESSION_MAX))
+        self.proven = False
+
+    def locked(self, byte: int) -> bool:
+        """Whether the client has locked a byte."""
+        asked = _LOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, byte, 1, 0)
+        found = fcntl.fcntl(self.descriptor, fcntl.F_OFD_GETLK, asked)
+        kind: int = _LOCK.unpack(found)[0]
+        return kind != fcntl.F_UNLCK
+
+    def close(self) -> None:
+        self.cells.close()
+        os.close(self.descriptor)
+
+
+class ShardMarks:
+    """The pages of all sessions of one shard; called under its host's mutex.  See `UseMarks`."""
+
+    def __init__(self, folder: SharedFolder) -> None:
+        self._folder = folder
+        self._pages: dict[str, _ShardPage | None] = {}
+
+    def keep(self, session: str, number: int) -> int:
+        """Put a grant's number into a free cell of its session's page."""
+        page = self._pages.get(session)
+        if page is None:
+            if session not in self._pages:
+                self._pages[session] = self._made(session)
+                return PROVE if self._pages[session] is not None else NOT_KEPT
+            return NOT_KEPT
+        page.proven = page.proven or page.locked(_PROOF)
+        if not page.proven or not page.free:
+            return NOT_KEPT if page.proven else PROVE
+        place = page.places[number] = page.free.pop()
+        _CELL.pack_into(page.cells, place * _CELL.size, number)
+        return PLACES + place
+
+    def _made(self, session: str) -> _ShardPage | None:
+        """Make a session's page; None if there is no room for it, or no such locks."""
+        folder, name = self._folder, page_name(session)
+        flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+        try:
+            descriptor = os.open(name, flags, 0o600, dir_fd=folder.descriptor)
+            try:
+                os.fchmod(descriptor, folder.access.draft_mode)
+                os.posix_fallocate(descriptor, 0, PAGE_BYTES)
+                page = _ShardPage(descriptor)
+                page.locked(_PROOF)
+            except BaseException:
+                os.close(descriptor)
+                raise
+        except OSError as error:
+            _log.info("no grants are kept for session %s: %s", session[:8], error)
+            return None
+        return page
+
+    def _clear(self, session: str, number: int) -> _ShardPage:
+        page = self._pages[session]
+        assert page is not None
+        place = page.places.pop(number, None)
+        if place is not None:
+            _CELL.pack_into(page.cells, place * _CELL.size, 0)
+            page.free.append(place)
+        return page
+
+    def recall(self, session: str, number: int) -> bool:
+        """Clear a grant's cell, then return whether no block uses it."""
+        return not self._clear(session, number).locked(number)
+
+    def used(self, session: str, number: int) -> bool:
+        """Whether a block uses the grant now."""
+        page = self._pages[session]
+        return page is not None and page.locked(number)
+
+    def over(self, session: str, number: int) -> None:
+        """Clear a grant's cell; another grant may have it."""
+        self._clear(session, number)
+
+    def drop(self, session: str) -> None:
+        """Forget the page of a session that has ended."""
+        page = self._pages.pop(session, None)
+        if page is not None:
+            page.close()
+            if self._folder.descriptor >= 0:
+                os.unlink(page_name(session), dir_fd=self._folder.descriptor)
+
+
+class ClientPage:
+    """This session's page at one shard, as the client has it.
+
+    Closed with its last reference; a mark that it still has is given up with it.
+
+    Raises:
+        OSError: It cannot be opened, mapped or locked here.
+    """
+
+    __slots__ = ("_cells", "descriptor")
+
+    def __init__(self, folder: int, owner: int, session: str) -> None:
+        flags = os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+        self.descriptor = -1
+        descriptor = os.open(page_name(session), flags, dir_fd=folder)
+        try:
+            found = os.fstat(descriptor)
+            if found.st_uid != owner or found.st_size != PAGE_BYTES:
+                raise OSError(f"{page_name(session)} is no page of the shard's user {owner}")
+            self._cells = mmap.mmap(descriptor, PAGE_BYTES, mmap.MAP_SHARED, mmap.PROT_READ)
+            self.descriptor = descriptor
+            self.mark(_PROOF)
+        except BaseException:
+            os.close(descriptor)
+            self.descriptor = -1
+            raise
+
+    def __del__(self) -> None:
+        self.close()
+
+    def mark(self, number: int) -> None:
+        """Show that a block uses a grant."""
+        asked = _LOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, number, 1, 0)
+        fcntl.fcntl(self.descriptor, fcntl.F_OFD_SETLK, asked)
+
+    def unmark(self, number: int) -> None:
+        """Show that no block uses it any more."""
+        asked = _LOCK.pack(fcntl.F_UNLCK, os.SEEK_SET, number, 1, 0)
+        fcntl.fcntl(self.descriptor, fcntl.F_OFD_SETLK, asked)
+
+    def lives(self, place: int, number: int) -> bool:
+        """Whether a grant is not over; looked at after its mark was taken or given back."""
+        found: int = _CELL.unpack_from(self._cells, place * _CELL.size)[0]
+        return found == number
+
+    def close(self) -> None:
+        """Close the page; idempotent.  In a forked child this leaves the parent's marks."""
+        descriptor, self.descriptor = self.descriptor, -1
+        if descriptor >= 0:
+            os.close(descriptor)
