@@ -22,13 +22,12 @@ from enact_dist.access.reads import (
     Readings,
     check_requested,
     misfit,
-    refuse_changed,
     slot_of,
 )
 from enact_dist.access.session import bind, bound_before
 from enact_dist.access.together import Together
 from enact_dist.access.trigger import LockStatistics, Triggered
-from enact_dist.access.writes import Asked, Writing, reads_of
+from enact_dist.access.writes import Asked, Writing, reads_of, refuse_changed
 from enact_dist.core.client.plan import Phase
 from enact_dist.core.protocol.messages import SlotVersion
 from enact_dist.errors import (
@@ -167,6 +166,7 @@ class Lock(Triggered):
             self._granted_s = time.monotonic()
             self._readings = Readings(client, session.cache, lock.lock, lock.states, self._use)
             self._readings.asked = self._requests
+            self._readings.take_over(lock.keeping, self._bound.single.values())
             self._lock = lock
             self._asking = False
         except BaseException:
@@ -199,16 +199,17 @@ class Lock(Triggered):
             if kind is None:
                 if client.forked or client.closed:
                     client.check_usable()
-                shown, assigned = self._readings.changeable, self._writing.looked_at
-                if shown or assigned:
-                    refuse_changed(shown, assigned, self._writing.data, self._requests)
-                if self._writing.drafts:
-                    self._writing.fix()
+                readings, writing = self._readings, self._writing
+                if readings.changeable or writing.looked_at:
+                    shown, assigned = readings.changeable, writing.looked_at
+                    refuse_changed(shown, assigned, writing.data, self._requests)
+                if writing.drafts:
+                    writing.fix()
+                readings.pass_on(lock.keeping, self._bound.single.values(), writing.data)
                 only = lock.parts[0].shard if len(lock.parts) == 1 else ""
-                writes = self._writing.by_shard(lock.shard_of, only)
-                asked = self._bound.reads
-                reads = reads_of(self._readings, asked, self._each) if writes else _NO_READS
-                client.finish(lock, writes, tuple(self._expects.values()), *reads)
+                writes = writing.by_shard(lock.shard_of, only)
+                read = reads_of(readings, self._bound.reads, self._each) if writes else _NO_READS
+                client.finish(lock, writes, tuple(self._expects.values()), *read)
                 self.position = lock.position
         finally:
             # A commit leaves nothing to release; after an exception or interrupt this releases all.
@@ -226,17 +227,15 @@ class Lock(Triggered):
         """
         self._readings.end()
         self._each.clear()
-        if self._lock is not None:
-            self._lock.states.clear()
-            self._lock.cut = None
+        if (lock := self._lock) is not None:
+            lock.states.clear()
+            lock.cut = None
 
     def _use(self) -> None:
         """Raise unless the block is running and the lock not known to be lost."""
         if self._lock is None or self._over:
             raise LockReleasedError(f"{self!r} is used outside its `with` block")
-        client = self._session.client
-        if client.forked or client.closed:
-            client.check_usable()
+        self._session.client.check_usable()
         if self._lock.phase is not Phase.HELD:
             self.check()
 

@@ -18,8 +18,6 @@ from collections.abc import ItemsView, Iterator, Mapping, ValuesView
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
-import numpy as np
-
 from enact_dist.config.table import suggestion
 from enact_dist.core.protocol.datum import Datum, Slot
 from enact_dist.core.protocol.messages import DatumRead
@@ -34,7 +32,7 @@ from enact_dist.link.client.fetch import CACHED_BYTES_MIN, fetch_all
 from enact_dist.patterns import pattern_matches
 from enact_dist.terms import Access, Aspect, Entity, LockRequest, NullReason
 from enact_dist.wire import codecs
-from enact_dist.wire.payload import decode_datum, encode_parts
+from enact_dist.wire.payload import decode_datum
 from enact_dist.wire.shapes import (
     CodecOf,
     DictOf,
@@ -49,20 +47,21 @@ from enact_dist.wire.shapes import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 
+    from enact_dist.core.client.kept import Keeping
     from enact_dist.core.client.plan import Reading
     from enact_dist.core.protocol.datum import Datum, LockId, Slot
     from enact_dist.core.protocol.messages import SlotState
     from enact_dist.link.client.fetch import DatumCache
     from enact_dist.link.client.locks import CellClient
-    from enact_dist.terms import LockRequest
-    from enact_dist.wire.payload import Encoded
+    from enact_dist.terms import Aspect, LockRequest
+
+    Single = tuple[Slot, Aspect[Any], bool]
     from enact_dist.wire.shapes import Shape
 
-NAMED_MAX: Final = 4
-"""So many slots are named in one error."""
-
 _changeable: dict[Any, bool] = {}
+_lasting: dict[Any, bool] = {}
 codecs.changed.append(_changeable.clear)
+codecs.changed.append(_lasting.clear)
 
 
 class ReceivedValue(NamedTuple):
@@ -85,6 +84,16 @@ def changeable(datum_type: Any) -> bool:
     return known
 
 
+def _lasts(datum_type: Any) -> bool:
+    """Whether no value of this type can be changed at all: a codec may make what can."""
+    known = _lasting.get(datum_type)
+    if known is None:
+        parts = list(_parts(shape_of(datum_type)))
+        known = not any(_is_container(part) or isinstance(part, CodecOf) for part in parts)
+        _lasting[datum_type] = known
+    return known
+
+
 def _is_container(shape: Shape) -> bool:
     if isinstance(shape, Plain):
         return shape.kind in (list, dict, object)
@@ -103,84 +112,6 @@ def _parts(shape: Shape) -> Iterator[Shape]:
         case RecordOf(_, fields):
             for _, part in fields:
                 yield from _parts(part)
-
-
-def refuse_changed(
-    shown: Mapping[Slot, ReceivedValue],
-    assigned: Mapping[Slot, ReceivedValue],
-    written: Mapping[Slot, Datum | None],
-    requests: Collection[LockRequest[Any]],
-) -> None:
-    """Raise `MisuseError` if what a block could have written was changed and not assigned.
-
-    Args:
-        shown: What the block has looked at, as it was granted.
-        assigned: What it has looked at of its own writes, since it wrote them.
-        written: What it sets.
-        requests: Those of the lock.
-    """
-    looked_at = {slot: one for slot, one in shown.items() if slot not in written} | {**assigned}
-    if not looked_at:
-        return
-    single = {one.address: one for one in requests if one.access.writes and not one.access.each}
-    each = [one for one in requests if one.access.writes and one.access.each]
-    changed = {}
-    for slot, one in looked_at.items():
-        request = single.get(slot) or _allowing(each, slot)
-        if request is not None and _was_changed(one):
-            changed[slot] = request
-    if changed:
-        slot, request = next(iter(changed.items()))
-        names = [f"{slot.entity}/{slot.aspect} in {slot.context}" for slot in changed]
-        more = f" and {len(names) - NAMED_MAX} more" if len(names) > NAMED_MAX else ""
-        at = f"lock[{request!r}]"
-        if request.access is Access.WRITE_EACH:
-            at += f"[Entity({slot.entity!r})]"
-        raise MisuseError(
-            f"{', '.join(names[:NAMED_MAX])}{more} was changed in place, which publishes nothing;"
-            f" nothing was written: change the value, then assign it: {at} = value"
-        )
-
-
-def _allowing(each: Iterable[LockRequest[Any]], slot: Slot) -> LockRequest[Any] | None:
-    """Return the pattern that allows to write a slot, None where none does."""
-    for request in each:
-        context, pattern, aspect = request.address
-        if (context, aspect) == (slot.context, slot.aspect) and pattern_matches(
-            pattern, slot.entity
-        ):
-            return request
-    return None
-
-
-def _was_changed(shown: ReceivedValue) -> bool:
-    """Whether a value is another one than its datum's."""
-    now = _encoded(shown.value, shown.datum_type)
-    datum = shown.datum
-    if now is not None and not now.size and not datum.size and now.encoding == datum.encoding:
-        return False
-    # Not with its bytes themselves, which another release may have written in another way.
-    before = _encoded(decode_datum(datum, shown.datum_type), shown.datum_type)
-    if now is None or before is None:
-        return before is not None
-    if now.encoding != before.encoding or len(now.parts) != len(before.parts):
-        return True
-    return not all(map(_same_bytes, now.parts, before.parts))
-
-
-def _encoded(value: object, datum_type: Any) -> Encoded | None:
-    """Return a value's bytes; None where it is no datum (any more)."""
-    try:
-        return encode_parts(value, datum_type)
-    except DatumTypeError:
-        return None
-
-
-def _same_bytes(left: Any, right: Any) -> bool:
-    """Whether two parts are the same; arrays over the same memory are not gone through."""
-    one, other = np.frombuffer(left, np.uint8), np.frombuffer(right, np.uint8)
-    same_place = one.ctypes.data == other.ctypes.data and one.size == other.size
-    return same_place or np.array_equal(one, other)
 
 
 T = TypeVar("T")
@@ -239,6 +170,24 @@ class Readings:
         self.looked_at.clear()
         self.changeable.clear()
         self._kept.clear()
+
+    def take_over(self, keeping: Keeping | None, single: Collection[Single]) -> None:
+        """Take over what an earlier block of the same kept grant has decoded."""
+        for slot, aspect, _ in single if keeping is not None and keeping.values else ():
+            datum_type, value = keeping.values.get(slot, (None, None))  # type: ignore[union-attr]
+            if datum_type is not None and datum_type is aspect.datum_type:
+                self.looked_at[slot] = value
+
+    def pass_on(
+        self, keeping: Keeping | None, single: Collection[Single], written: Collection[Slot]
+    ) -> None:
+        """Leave to the next block of the same grant what it need not decode, with its type."""
+        if keeping is not None:
+            keeping.values = {
+                slot: (aspect.datum_type, self.looked_at[slot])
+                for slot, aspect, _ in single
+                if slot in self.looked_at and slot not in written and _lasts(aspect.datum_type)
+            }
 
     def state(self, slot: Slot) -> SlotState | None:
         """Return the state of a slot, or None if it was not shown (a pattern, and null)."""

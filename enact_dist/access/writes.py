@@ -25,33 +25,34 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias, cast
 
+import numpy as np
+
 from enact_dist.access.reads import ReceivedValue, changeable, misfit, null_error
 from enact_dist.core.protocol.datum import Datum, Slot
 from enact_dist.core.protocol.messages import WriteItem
 from enact_dist.core.protocol.parts import READS_MAX
 from enact_dist.errors import DatumTypeError, MisuseError
+from enact_dist.patterns import pattern_matches
+from enact_dist.terms import Access
 from enact_dist.wire.limits import BODY_BYTES_MAX, ITEMS_MAX, PAYLOAD_BYTES_MIN
 from enact_dist.wire.payload import decode_datum, decode_to_fill, encode_parts, joined
 from enact_dist.wire.shapes import ArrayOf, RecordOf, shape_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Collection, Iterable, Sequence
 
     from numpy.typing import DTypeLike, NDArray
 
+    from enact_dist.access.reads import EachData, Readings
+    from enact_dist.core.protocol.messages import DatumRead
     from enact_dist.link.memory.payload_client import Draft, SharedPayloads
+    from enact_dist.terms import Aspect, LockRequest
     from enact_dist.wire.payload import Encoded
     from enact_dist.wire.shapes import Shape
 
     ShapeLike: TypeAlias = int | Sequence[int]
     ShapesLike: TypeAlias = ShapeLike | Mapping[str, ShapeLike]
     DTypesLike: TypeAlias = DTypeLike | Mapping[str, DTypeLike] | None
-    from collections.abc import Iterable, Mapping
-
-    from enact_dist.access.reads import EachData, Readings
-    from enact_dist.core.protocol.datum import Slot
-    from enact_dist.core.protocol.messages import DatumRead
-    from enact_dist.terms import Aspect, LockRequest
 
 
 def reads_of(
@@ -83,6 +84,88 @@ def reads_of(
 
 
 _write_of: Final = partial(tuple.__new__, WriteItem)
+
+
+NAMED_MAX: Final = 4
+"""So many slots are named in one error."""
+
+
+def refuse_changed(
+    shown: Mapping[Slot, ReceivedValue],
+    assigned: Mapping[Slot, ReceivedValue],
+    written: Mapping[Slot, Datum | None],
+    requests: Collection[LockRequest[Any]],
+) -> None:
+    """Raise `MisuseError` if what a block could have written was changed and not assigned.
+
+    Args:
+        shown: What the block has looked at, as it was granted.
+        assigned: What it has looked at of its own writes, since it wrote them.
+        written: What it sets.
+        requests: Those of the lock.
+    """
+    looked_at = {slot: one for slot, one in shown.items() if slot not in written} | {**assigned}
+    if not looked_at:
+        return
+    single = {one.address: one for one in requests if one.access.writes and not one.access.each}
+    each = [one for one in requests if one.access.writes and one.access.each]
+    changed = {}
+    for slot, one in looked_at.items():
+        request = single.get(slot) or _allowing(each, slot)
+        if request is not None and _was_changed(one):
+            changed[slot] = request
+    if changed:
+        slot, request = next(iter(changed.items()))
+        names = [f"{slot.entity}/{slot.aspect} in {slot.context}" for slot in changed]
+        more = f" and {len(names) - NAMED_MAX} more" if len(names) > NAMED_MAX else ""
+        at = f"lock[{request!r}]"
+        if request.access is Access.WRITE_EACH:
+            at += f"[Entity({slot.entity!r})]"
+        raise MisuseError(
+            f"{', '.join(names[:NAMED_MAX])}{more} was changed in place, which publishes nothing;"
+            f" nothing was written: change the value, then assign it: {at} = value"
+        )
+
+
+def _allowing(each: Iterable[LockRequest[Any]], slot: Slot) -> LockRequest[Any] | None:
+    """Return the pattern that allows to write a slot, None where none does."""
+    for request in each:
+        context, pattern, aspect = request.address
+        if (context, aspect) == (slot.context, slot.aspect) and pattern_matches(
+            pattern, slot.entity
+        ):
+            return request
+    return None
+
+
+def _was_changed(shown: ReceivedValue) -> bool:
+    """Whether a value is another one than its datum's."""
+    now = _encoded(shown.value, shown.datum_type)
+    datum = shown.datum
+    if now is not None and not now.size and not datum.size and now.encoding == datum.encoding:
+        return False
+    # Not with its bytes themselves, which another release may have written in another way.
+    before = _encoded(decode_datum(datum, shown.datum_type), shown.datum_type)
+    if now is None or before is None:
+        return before is not None
+    if now.encoding != before.encoding or len(now.parts) != len(before.parts):
+        return True
+    return not all(map(_same_bytes, now.parts, before.parts))
+
+
+def _encoded(value: object, datum_type: Any) -> Encoded | None:
+    """Return a value's bytes; None where it is no datum (any more)."""
+    try:
+        return encode_parts(value, datum_type)
+    except DatumTypeError:
+        return None
+
+
+def _same_bytes(left: Any, right: Any) -> bool:
+    """Whether two parts are the same; arrays over the same memory are not gone through."""
+    one, other = np.frombuffer(left, np.uint8), np.frombuffer(right, np.uint8)
+    same_place = one.ctypes.data == other.ctypes.data and one.size == other.size
+    return same_place or np.array_equal(one, other)
 
 
 class _Written(NamedTuple):

@@ -65,7 +65,7 @@ TEXT = Aspect("text", str, Durability.VOLATILE)
 def payloads():
     """Return the names of all payloads in this test's shared folders."""
     root = Path(os.environ.get("ENACT_SHARED_FOLDER", "/nonexistent"))
-    return [path.name for path in root.glob("*/*-*")]
+    return [path.name for path in root.glob("*/*-*") if not path.name.startswith("uses-")]
 
 
 def come_down_to(count):

@@ -19,11 +19,11 @@ PACKAGE = str(Path(enact_dist.__file__).parent)
 COUNT = Aspect("count", int, Durability.VOLATILE)
 SIDES = ("caller", "enact-socket")
 """The threads that an update passes: the caller's, and that of its connection to the shard."""
-FILES_MAX, CHANGES_MAX = 39, 118
+FILES_MAX, CHANGES_MAX = 40, 99
 """What an update takes at present, rounded up; lower them whenever it takes less.  The aim is 24 files
 and 110 changes of file.
 """
-CALLS_MAX = 155
+CALLS_MAX = 130
 """Functions of the package that it calls, 417 once; the aim is 150."""
 UPDATES = 50
 

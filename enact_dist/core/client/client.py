@@ -72,6 +72,7 @@ class Client(ClientSession[MultiLock]):
         seq = self._seqs[lane] = self._seqs.get(lane, 0) + 1
         lock = MultiLock(self, LockId(self.session, lane, seq), grant.plan, now_ns, hold_ns)
         lock.keeping, part = Keeping(grant.items, grant, now_ns), lock.parts[0]
+        lock.keeping.values = grant.values
         part.token, part.granted_count, part.until_ns = grant.token, grant.count, grant.until_ns
         part.hold_until_ns = now_ns + shortened_ns(hold_ns)
         lock.states += map(Reading, repeat(part.shard), repeat(epoch), grant.states)

@@ -15,8 +15,8 @@ Rules a change must keep
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Protocol
 
 from enact_dist.core.client.plan import Phase
 from enact_dist.core.protocol.messages import NOT_KEPT, PLACES
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from enact_dist.core.client.plan import Part, Plan, Reading
-    from enact_dist.core.protocol.datum import LockId, Token
+    from enact_dist.core.protocol.datum import LockId, Slot, Token
     from enact_dist.core.protocol.messages import GrantLeft, Item, SlotState, SlotVersion, WriteItem
 
 
@@ -45,6 +45,7 @@ class KeptGrant:
         states: What its slots are, in the order of the plan.
         count: The session's message counter when it was granted.
         until_ns: Until when it may be believed in (CLOCK_BOOTTIME).
+        values: What its blocks have decoded, by slot; not looked at here.
     """
 
     items: tuple[Item, ...]
@@ -56,6 +57,7 @@ class KeptGrant:
     states: tuple[SlotState, ...]
     count: int
     until_ns: int
+    values: dict[Slot, Any] = field(default_factory=dict)
 
     @property
     def shard(self) -> str:
@@ -73,7 +75,7 @@ class KeptGrant:
         self.states = tuple([written.get(state.slot, state) for state in self.states])
 
 
-class KeptGrants:
+class OwnGrants:
     """The kept grants of one session, none of them in use; by what was requested."""
 
     __slots__ = ("by_items",)
@@ -119,15 +121,17 @@ class Keeping:
 
     Attributes:
         items: The requests under which its grant is to be kept.
-        grant: The kept grant that it uses, or has been told to keep.
+        grant: The kept grant that it uses, or may keep.
         begun_ns: When it began under a kept grant (0: it was asked for).
         said: What the shard has said of its grant; see `Committed`.
+        values: What its blocks have decoded and did not write; goes with the grant.
     """
 
     items: tuple[Item, ...]
     grant: KeptGrant | None = None
     begun_ns: int = 0
     said: int = NOT_KEPT
+    values: dict[Slot, Any] = field(default_factory=dict)
 
     def used_ns(self, now_ns: int) -> int:
         """Return how long the block under a kept grant has lasted; 0 under any other."""
@@ -169,6 +173,8 @@ class Keeping:
     def take_grant(self) -> KeptGrant | None:
         """Return the grant that stays, for its mark to be given back and its cell looked at."""
         grant, self.grant = self.grant, None
+        if grant is not None:
+            grant.values = self.values
         return grant
 
 

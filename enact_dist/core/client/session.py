@@ -14,7 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
-from enact_dist.core.client.kept import KeptGrants
+from enact_dist.core.client.kept import OwnGrants
 from enact_dist.core.client.lease_clock import Sendings
 from enact_dist.core.client.own_commits import Unsettled
 from enact_dist.core.client.plan import Phase
@@ -121,7 +121,7 @@ class ClientSession(Generic[L]):
         self._seqs: dict[int, int] = {}
         self.greeted: set[str] = set()
         self.unsettled = Unsettled()
-        self.kept = KeptGrants()
+        self.kept = OwnGrants()
 
     # ---------------------------------------------------------------- shards
 

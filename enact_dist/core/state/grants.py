@@ -418,7 +418,7 @@ class Tenures:
             if tenure is None or tenure.token is None or tenure.bound:
                 continue
             if tenure.kept and not tenure.recalled:
-                continue  # nobody waits for it; its hold limit begins when it is recalled
+                continue  # no lock waits for it; its hold limit begins when it is recalled
             if tenure.hold_end_ns > now_ns:
                 heapq.heappush(self._hold_ends, (tenure.hold_end_ns, lock))
             else:

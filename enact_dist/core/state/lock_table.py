@@ -260,7 +260,7 @@ class LockTable:
         return claim
 
     def awaited(self, claim: Claim) -> bool:
-        """Whether somebody waits for what a granted claim holds."""
+        """Whether another lock waits for what a granted claim holds."""
         for resource, mode in claim.wants.items():
             queue = self._queues[resource]
             if queue.waiters and any(queue.waiting[other] for other in CONFLICTS[mode]):

@@ -10,10 +10,10 @@ a message.  Client and shard agree through a page of shared memory and a file lo
 
 Rules a change must keep
   * The cell is cleared first, and the mark asked for afterwards.  In the other order a recall
-    between a client's look and the return of its mark would be seen by nobody.
+    between a client's look and the return of its mark would be missed by both.
   * The cell is cleared at every end of a kept grant: cells outlive the shard's process.
   * Under a kept grant a commit is accepted only with a higher seq than its lane has used.
-  * A grant is kept only while nobody waits for what it holds, so nobody is overtaken.
+  * A grant is kept only while no lock waits for what it holds, so no lock is overtaken.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Tenure:
         owner: The identity of its session (see `core.shard.owners`).
         keepable: Whether its grant may stay with the session.
         kept: What the client was told when its grant stayed; 0 while it was not.
-        recalled: Somebody waits for a kept grant in use: it ends with that block.
+        recalled: Another lock waits for a kept grant in use: it ends with that block.
     """
 
     lock: LockId
@@ -209,7 +209,7 @@ class KeptGrants:
 
     Attributes:
         by_number: All, by the number of their token.
-        recalled: Those in use for which somebody waits.
+        recalled: Those in use for which another lock waits.
         marks: What client and shard of one host can see of each other.
         closed: The shard is about to stop and lets no more grants stay.
     """
@@ -257,7 +257,7 @@ class KeptGrants:
 
         Args:
             tenure: The grant; bound no more.
-            awaited: Whether somebody waits for what it holds.
+            awaited: Whether another lock waits for what it holds.
 
         Returns:
             What the client is told; below `PLACES` the grant is over.
@@ -302,7 +302,7 @@ class KeptGrants:
         return habit
 
     def recall(self, tenure: Tenure) -> bool:
-        """Take a kept grant back for somebody who waits.
+        """Take a kept grant back for another lock.
 
         Returns:
             Whether it is over; else a block uses it, and it ends with that block.

@@ -24,7 +24,6 @@ from enact_dist.core.protocol.messages import (
     OUTCOME_COMMITTED,
     OUTCOME_PENDING,
     OUTCOME_UNSEEN,
-    PROVE,
     Commit,
     Explain,
     Outcome,
@@ -37,6 +36,7 @@ from enact_dist.core.protocol.messages import (
 from enact_dist.core.shard.on_lock import NEWER_TYPE
 from enact_dist.errors import CommitUnknownError, EnactError, MisuseError
 from enact_dist.link.client.calls import BYTES_PER_S_MIN, CALL_S, bytes_with, request_timeout_s
+from enact_dist.link.client.kept import Asked
 from enact_dist.link.client.lanes import name_of, read_name
 from enact_dist.link.client.session import (
     CALLS_S_MAX,
@@ -103,45 +103,19 @@ class CellClient(SessionClient):
         """
         if self.forked or self.closed:
             self.check_usable()
-        items, begun = tuple(items), [] if begun is None else begun
-        core, started_ns = self.core, self._now_ns()
+        begun = [] if begun is None else begun
+        started_ns = self._now_ns()
         give_up_ns = started_ns + int(min(wait_s, CALLS_S_MAX) * 1e9)
+        asked = Asked(tuple(items), give_up_ns, int(hold_s * 1e9), past_ns, keep, interrupt, begun)
         if started_ns >= self.renewal.used_until_ns:
             self.renewal.used()
-        lock_views = False
         try:
             lane = self._lanes.free.pop()
         except IndexError:
             lane = self._lanes.take()
         try:
-            if keep and keep in core.kept.by_items and not (interrupt and interrupt.is_set()):
-                kept = self._begin_kept(lane, keep, int(hold_s * 1e9), begun)
-                if kept is not None:
-                    return kept
-            for attempt in itertools.count():
-                with self._mutex:
-                    plan = core.plan(items, lock_views=lock_views, past_ns=past_ns)
-                    now_ns = self._now_ns()
-                    wait_ns, hold_ns = max(0, give_up_ns - now_ns), int(hold_s * 1e9)
-                    lock = core.begin(lane, plan, now_ns=now_ns, wait_ns=wait_ns, hold_ns=hold_ns)
-                    begun.append(lock)
-                    if keep and plan.keepable and self.payloads.keeps(plan.locks[0][0]):
-                        lock.keeping = Keeping(keep)
-                    for before in begun[-2:-1]:
-                        before.lane_free = True  # the next lock takes over the lane
-                if interrupt is not None:
-                    lock.slice_ns = INTERRUPTIBLE_SLICE_NS
-                self._drive(lock, interrupt=interrupt)
-                if lock.phase is Phase.HELD:
-                    return lock
-                over = attempt > 0 and self._now_ns() >= give_up_ns
-                if over or not self._begins_anew(lock, attempt):
-                    break
-                lock_views = lock.no_cut and not core.observer and not past_ns
-                if lock_views:
-                    self.count("views_locked")
-            waited_s = (self._now_ns() - started_ns) / 1e9
-            raise not_granted(lock, waited_s, self.carrier.endpoint_of, items)
+            kept = self._kept.begin(lane, asked) if keep in self.core.kept.by_items else None
+            return kept or self._ask(lane, asked)
         except BaseException:
             self._release_of(lane)
             if begun:
@@ -150,45 +124,35 @@ class CellClient(SessionClient):
                 self._lanes.give_back(lane)
             raise
 
-    def _begin_kept(
-        self, lane: int, items: tuple[Item, ...], hold_ns: int, begun: list[MultiLock]
-    ) -> MultiLock | None:
-        """Begin a lock under a grant that this session has kept; None if it has to be asked for."""
-        grant = self.core.kept.take(items)
-        if grant is None:
-            return None
-        page = self.payloads.page(grant.shard, grant.token.epoch)
-        if page is None:
-            return None
-        lock, number = None, grant.token.number
-        page.mark(number)
-        try:
-            if page.lives(grant.place, number):
-                with self._mutex:
-                    lock = self.core.begin_kept(lane, grant, now_ns=self._now_ns(), hold_ns=hold_ns)
-                    if lock is not None:
-                        begun.append(lock)
-        finally:
-            if lock is None:
-                page.unmark(number)
-        return lock
-
-    def _leave_kept(self, lock: MultiLock, keeping: Keeping) -> None:
-        """Give the mark of a block back, and keep its grant if that still lives."""
-        part, grant = lock.parts[0], keeping.take_grant()
-        page = self.payloads.page(part.shard, part.token.epoch) if part.token else None
-        if part.token is None or page is None:
-            if keeping.said == PROVE:
-                self.payloads.prove(part.shard)
-            return
-        number = part.token.number
-        if keeping.begun_ns:
-            keeping.begun_ns = 0
-            page.unmark(number)
-        if grant is not None and page.lives(grant.place, number):
-            self.core.kept.put_back(grant)
-        elif grant is not None:
-            lock.farewells.append((part.shard, Release(grant.origin)))
+    def _ask(self, lane: int, asked: Asked) -> MultiLock:
+        """Ask for a lock, as often as it takes, until it is held or cannot be."""
+        core, begun, interrupt = self.core, asked.begun, asked.interrupt
+        lock_views, started_ns = False, self._now_ns()
+        for attempt in itertools.count():
+            with self._mutex:
+                plan = core.plan(asked.items, lock_views=lock_views, past_ns=asked.past_ns)
+                now_ns = self._now_ns()
+                wait_ns, hold_ns = max(0, asked.give_up_ns - now_ns), asked.hold_ns
+                lock = core.begin(lane, plan, now_ns=now_ns, wait_ns=wait_ns, hold_ns=hold_ns)
+                begun.append(lock)
+                keeps = asked.keep and plan.keepable and not lock_views
+                if keeps and self.payloads.keeps(plan.locks[0][0]):
+                    lock.keeping = Keeping(asked.keep)
+                for before in begun[-2:-1]:
+                    before.lane_free = True  # the next lock takes over the lane
+            if interrupt is not None:
+                lock.slice_ns = INTERRUPTIBLE_SLICE_NS
+            self._drive(lock, interrupt=interrupt)
+            if lock.phase is Phase.HELD:
+                return lock
+            over = attempt > 0 and self._now_ns() >= asked.give_up_ns
+            if over or not self._begins_anew(lock, attempt):
+                break
+            lock_views = lock.no_cut and not core.observer and not asked.past_ns
+            if lock_views:
+                self.count("views_locked")
+        waited_s = (self._now_ns() - started_ns) / 1e9
+        raise not_granted(lock, waited_s, self.carrier.endpoint_of, asked.items)
 
     def _release_of(self, lane: int) -> None:
         """Release the lock of a lane, even one that an interrupt kept from being recorded.
@@ -423,7 +387,7 @@ class CellClient(SessionClient):
                 with self._mutex:
                     lock.release()
             if lock.keeping is not None:
-                self._leave_kept(lock, lock.keeping)
+                self._kept.leave(lock, lock.keeping)
             if lock.farewells:
                 self._say_farewell(lock)
         finally:

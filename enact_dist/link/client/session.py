@@ -41,6 +41,7 @@ from enact_dist.errors import EnactError, MisuseError
 from enact_dist.link.carrier import FORKED_REMEDY
 from enact_dist.link.client.calls import CALL_S, Calls, request_timeout_s
 from enact_dist.link.client.catalogue import CATALOGUES, FurtherShards, KnownCatalogue
+from enact_dist.link.client.kept import KeptUses
 from enact_dist.link.client.lanes import Lanes
 from enact_dist.link.client.pauses import Pauses, Renewal, keep_renewing, weakly
 from enact_dist.link.clock import boottime_ns
@@ -118,6 +119,7 @@ class SessionClient:
             weakly(self.count),
             inside=carrier.inside,
         )
+        self._kept = KeptUses(client, self.payloads, self._mutex, now_ns)
         self._further = FurtherShards(carrier, client.placement, now_ns, weakly(self.count), doubts)
         self._renewer: threading.Thread | None = None
         if keep_alive:
