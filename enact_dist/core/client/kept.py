@@ -138,7 +138,7 @@ class Keeping:
         return now_ns - self.begun_ns if self.begun_ns else 0
 
     def ends(self, phase: Phase, *, sent: bool) -> bool:
-        """Take in how the lock ends; return whether nothing is left to be told to the shard.
+        """Take in how the lock ends; return whether nothing is left to report to the shard.
 
         Args:
             phase: In which the lock rests.

@@ -72,7 +72,7 @@ class Holder(NamedTuple):
     """The holder or waiter of a lock, for messages to people.
 
     `kept` says of a grant that stays with its session between two blocks how it is used: "unused",
-    "used", or "recalled" (in use, while somebody waits); "" of any other.
+    "used", or "recalled" (in use, while another lock waits); "" of any other.
     """
 
     lock: LockId
@@ -190,7 +190,7 @@ class GrantLeft(NamedTuple):
 
 
 NOT_KEPT: Final = 0
-"""What is told of a grant that is over."""
+"""Of a grant that is over."""
 PROVE: Final = 1
 """It is over, too, and the client shall first lock byte 0 of its page, which proves that the shard
 sees the locks of this client's files."""

@@ -320,7 +320,7 @@ class Tenures:
             now_ns: The present.
 
         Returns:
-            What the client is told (see `Committed`), and the answers to others.
+            What the answer to the client says (see `Committed`), and the answers to others.
         """
         told = NOT_KEPT
         if keep and tenure.keepable:

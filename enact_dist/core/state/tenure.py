@@ -61,7 +61,7 @@ class Tenure:
         prepared: What another shard decides about.
         owner: The identity of its session (see `core.shard.owners`).
         keepable: Whether its grant may stay with the session.
-        kept: What the client was told when its grant stayed; 0 while it was not.
+        kept: What the answer said when its grant stayed; 0 while it was not.
         recalled: Another lock waits for a kept grant in use: it ends with that block.
     """
 
@@ -159,7 +159,7 @@ class UseMarks(Protocol):
         """Put a grant's number into a free cell of its session's page.
 
         Returns:
-            What the client is told: `PLACES` and more is the cell; below, why there is none.
+            What the answer says: `PLACES` and more is the cell; below, why there is none.
         """
 
     def recall(self, session: str, number: int) -> bool:
@@ -260,7 +260,7 @@ class KeptGrants:
             awaited: Whether another lock waits for what it holds.
 
         Returns:
-            What the client is told; below `PLACES` the grant is over.
+            What the answer to the client says; below `PLACES` the grant is over.
         """
         habit = self._habit(tenure)
         if awaited or tenure.recalled or self.closed:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from enact_dist.link.memory.payload_client import SharedPayloads
 
 
-class Asked(NamedTuple):
+class WantedLock(NamedTuple):
     """What a thread asks for: the arguments of `CellClient.acquire`."""
 
     items: tuple[Item, ...]
@@ -52,7 +52,7 @@ class KeptUses:
         self._core, self._payloads = core, payloads
         self._mutex, self._now_ns = mutex, now_ns
 
-    def begin(self, lane: int, asked: Asked) -> MultiLock | None:
+    def begin(self, lane: int, asked: WantedLock) -> MultiLock | None:
         """Begin a lock under a grant that is kept; None if it has to be asked for."""
         if asked.interrupt is not None and asked.interrupt.is_set():
             return None

@@ -36,7 +36,7 @@ from enact_dist.core.protocol.messages import (
 from enact_dist.core.shard.on_lock import NEWER_TYPE
 from enact_dist.errors import CommitUnknownError, EnactError, MisuseError
 from enact_dist.link.client.calls import BYTES_PER_S_MIN, CALL_S, bytes_with, request_timeout_s
-from enact_dist.link.client.kept import Asked
+from enact_dist.link.client.kept import WantedLock
 from enact_dist.link.client.lanes import name_of, read_name
 from enact_dist.link.client.session import (
     CALLS_S_MAX,
@@ -106,7 +106,9 @@ class CellClient(SessionClient):
         begun = [] if begun is None else begun
         started_ns = self._now_ns()
         give_up_ns = started_ns + int(min(wait_s, CALLS_S_MAX) * 1e9)
-        asked = Asked(tuple(items), give_up_ns, int(hold_s * 1e9), past_ns, keep, interrupt, begun)
+        asked = WantedLock(
+            tuple(items), give_up_ns, int(hold_s * 1e9), past_ns, keep, interrupt, begun
+        )
         if started_ns >= self.renewal.used_until_ns:
             self.renewal.used()
         try:
@@ -124,7 +126,7 @@ class CellClient(SessionClient):
                 self._lanes.give_back(lane)
             raise
 
-    def _ask(self, lane: int, asked: Asked) -> MultiLock:
+    def _ask(self, lane: int, asked: WantedLock) -> MultiLock:
         """Ask for a lock, as often as it takes, until it is held or cannot be."""
         core, begun, interrupt = self.core, asked.begun, asked.interrupt
         lock_views, started_ns = False, self._now_ns()
