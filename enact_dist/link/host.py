@@ -59,7 +59,7 @@ from enact_dist.errors import StoreError
 from enact_dist.link.clock import Clock, SystemClock
 from enact_dist.link.host_figures import Stalls, figures_of, latencies_of
 from enact_dist.link.memory.payload_desk import PayloadDesk, half_of, names_payloads
-from enact_dist.link.memory.use_marks import ShardMarks, retains
+from enact_dist.link.memory.use_marks import mark_uses
 from enact_dist.link.signals import Uninterrupted
 
 if TYPE_CHECKING:
@@ -155,8 +155,7 @@ class ShardHost:
         payload_bytes_max: int | None = None,
     ) -> None:
         self._shard = shard
-        if shared is not None and retains():
-            shard.state.tenures.kept.marks = ShardMarks(shared)
+        mark_uses(shard.state.tenures.kept, shared)
         self._clock: Clock = clock or SystemClock()
         self._on_failure = on_failure
         self._payloads = PayloadDesk(
@@ -424,8 +423,11 @@ class ShardHost:
         """Submit arrived requests, then advance time; return when the next tick is due, in ns."""
         for drain in self._inboxes:
             drain()
-        sessions, tenures = self._shard.state.sessions, self._shard.state.tenures
-        self._payloads.sweep(sessions.by_id.__contains__, tenures.by_session.__contains__)
+        if drafts := self._payloads.drafts():
+            with self._mutex:
+                working = set(filter(self._shard.state.tenures.works, drafts.values()))
+            sessions = self._shard.state.sessions.by_id
+            self._payloads.sweep(sessions.__contains__, working.__contains__)
         store_thread = self._store_thread
         writing_since_s = store_thread.writing_since_s if store_thread is not None else None
         self._stalls.look(writing_since_s, time.monotonic())

@@ -38,7 +38,8 @@ def figures_of(
         now_ns: This host's monotonic clock.
     """
     tenures = list(state.tenures.by_lock.values())
-    held = sum(tenure.token is not None for tenure in tenures)
+    kept = len(state.tenures.kept.by_number)
+    granted = sum(tenure.token is not None for tenure in tenures)
     return {
         **counted(state),
         **payloads.figures(),
@@ -48,8 +49,9 @@ def figures_of(
         "sessions": len(state.sessions.by_id),
         "slots": state.slots.count,
         "slot_bytes": state.slots.bytes,
-        "locks_held": held,
-        "locks_waiting": len(tenures) - held,
+        "locks_held": granted - kept,
+        "locks_kept": kept,
+        "locks_waiting": len(tenures) - granted,
         "requests_parked": parked,
     }
 

@@ -341,7 +341,8 @@ class Shard:
                 yield from self.state.tenures.remove(tenure, now_ns=self.state.now_ns)
                 self.state.forget_top(tenure.lock)
             else:
-                self.state.count("leases_expired")
+                if not self.state.tenures.kept.is_unused(tenure):
+                    self.state.count("leases_expired")
                 ttl_s = found.ttl_ns / 1e9 if found is not None else 0.0
                 cause = f"its lease of {ttl_s:g} s expired without a sign of life"
                 yield from self.state.tenures.take_away(tenure, cause, now_ns=self.state.now_ns)

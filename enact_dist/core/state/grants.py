@@ -300,6 +300,11 @@ class Tenures:
         cause = ended[1] if ended is not None and ended[0] == lock else None
         return Fenced(lock, cause or self.kept.cause(token) or NOT_HELD)
 
+    def works(self, session: str) -> bool:
+        """Whether a session holds or awaits a lock, grants that it only keeps left out."""
+        mine = self.by_session.get(session, {}).values()
+        return any(not self.kept.is_unused(tenure) for tenure in mine)
+
     def recall_for(self, waiter: Tenure, *, now_ns: int) -> None:
         """Recall the kept grants in the way of a waiter; those that no block uses are over."""
         for claim in self.table.holders_against(waiter.claim):
@@ -350,6 +355,9 @@ class Tenures:
     def take_away(self, tenure: Tenure, cause: str, *, now_ns: int) -> Iterator[Effect]:
         """End a tenure against its holder's will, remembering why for its next message."""
         assert not tenure.bound
+        if self.kept.is_unused(tenure):
+            yield from self.remove(tenure, now_ns=now_ns)
+            return  # no block loses anything
         session = self._sessions.by_id.get(tenure.lock.session)
         if session is not None and tenure.token is not None:
             session.lane(tenure.lock.lane).ended = (tenure.lock, cause)
@@ -392,8 +400,9 @@ class Tenures:
         """Return how a kept grant is used now; "" for one that is not kept."""
         if not tenure.kept or tenure.token is None:
             return ""
-        used = self.kept.marks.used(tenure.lock.session, tenure.token.number)
-        return "recalled" if tenure.recalled else "used" if used else "unused"
+        if tenure.recalled:
+            return "recalled"
+        return "unused" if self.kept.is_unused(tenure) else "used"
 
     def told(self, tenure: Tenure, now_ns: int) -> str:
         """Return a lock as the log names it: whose it is, and of what."""

@@ -321,10 +321,16 @@ class KeptGrants:
         self._counters["grants_recalled"] += 1
         return False
 
+    def is_unused(self, tenure: Tenure) -> bool:
+        """Whether a grant is kept and no block uses it now."""
+        if not tenure.kept or tenure.bound or tenure.token is None:
+            return False
+        return not self.marks.used(tenure.lock.session, tenure.token.number)
+
     def end_unused(self) -> None:
         """End the recalled grants that no block uses any more: word of their end was lost."""
-        for number, tenure in list(self.recalled.items()):
-            if not tenure.committing and not self.marks.used(tenure.lock.session, number):
+        for tenure in list(self.recalled.values()):
+            if self.is_unused(tenure):
                 self._end(tenure)
 
     def over(self, tenure: Tenure) -> None:

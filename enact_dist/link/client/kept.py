@@ -76,6 +76,22 @@ class KeptUses:
                 page.unmark(number)
         return lock
 
+    def finish(self, lock: MultiLock) -> bool:
+        """End a lock that has written nothing without a message.
+
+        Returns:
+            False if its shard has to be asked: it did not begin under a kept grant, another lock
+            waits for it, it may have ended, or its lease may be over.
+        """
+        grant = lock.keeping.grant if lock.keeping is not None else None
+        if grant is None:
+            return False
+        page = self._payloads.page(grant.shard, grant.token.epoch)
+        if page is None or not page.lives(grant.place, grant.token.number):
+            return False
+        with self._mutex:
+            return lock.finish_kept(self._now_ns())
+
     def leave(self, lock: MultiLock, keeping: Keeping) -> None:
         """Give the mark of a block back, and keep its grant if that still lives."""
         part, grant = lock.parts[0], keeping.take_grant()

@@ -291,10 +291,8 @@ class CellClient(SessionClient):
         started_ns = self._now_ns()
         named, size = writes, 0
         try:
-            if not writes and not expects and lock.keeping is not None:
-                with self._mutex:
-                    if lock.finish_kept(started_ns):
-                        return
+            if not writes and not expects and self._kept.finish(lock):
+                return
             if writes and lock.phase is Phase.HELD:
                 size = sum(map(bytes_with, writes.values()))
                 if size > INLINE_BYTES_MAX:

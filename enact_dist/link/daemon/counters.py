@@ -261,7 +261,8 @@ GAUGES_OF_A_SHARD: Final[dict[str, Figure]] = {
     "slot_bytes": _gauge(
         f"bytes of the newest data of all slots: {BODIES}", "enact world tree shows each"
     ),
-    "locks_held": _gauge("locks held now"),
+    "locks_held": _gauge("locks held now, kept grants left out"),
+    "locks_kept": _gauge("grants that stay with their sessions between two locks, used or not"),
     "locks_waiting": _gauge("locks waiting now", "enact lock ls shows who holds them up"),
     "requests_parked": _gauge("requests waiting for an answer"),
 }

@@ -430,7 +430,9 @@ class PayloadDesk:
             self._count("drafts_swept", len(gone))
 
     def drafts(self) -> dict[str, str]:
-        """Return the session of each draft, by its name.  For tests and simulation."""
+        """Return the session of each draft, by its name."""
+        if not self._drafts:
+            return {}
         with self._mutex:
             return {file: draft.session for file, draft in self._drafts.items()}
 

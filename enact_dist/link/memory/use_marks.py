@@ -11,8 +11,10 @@ The client's lock on byte 0 proves to the shard that it sees the locks of this c
 system without such locks, or one whose locks end at a container's wall, never shows it, and no
 grant is kept.
 
-What a kernel call orders here: either side changes its own word first (mark or cell) and looks at
-the other's afterwards, and each change of a mark is a system call.
+Either side changes its own word first (mark or cell) and looks at the other's afterwards.  The
+kernel takes the spin lock of the file's list of locks both to change it and to look at it, which
+orders the two on every processor; it leaves that out only for an empty list, and the lock on byte 0
+keeps it from being empty.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ from enact_dist.core.protocol.messages import NOT_KEPT, PLACES, PROVE
 from enact_dist.core.state.tenure import KEPT_OF_SESSION_MAX
 
 if TYPE_CHECKING:
+    from enact_dist.core.state.tenure import KeptGrants
     from enact_dist.link.memory.shared_folder import SharedFolder
 
 RETAIN_VARIABLE: Final = "ENACT_RETAIN"
@@ -145,6 +148,12 @@ class ShardMarks:
             page.close()
             if self._folder.descriptor >= 0:
                 os.unlink(page_name(session), dir_fd=self._folder.descriptor)
+
+
+def mark_uses(kept: KeptGrants, folder: SharedFolder | None) -> None:
+    """Let a shard keep grants for the clients that share its folder."""
+    if folder is not None and retains():
+        kept.marks = ShardMarks(folder)
 
 
 class ClientPage:
