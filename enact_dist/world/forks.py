@@ -173,7 +173,8 @@ def _refuse_locked(session: Session, name: str) -> None:
     """Raise while a slot of a context is locked, before any shard has dropped it."""
     for _, answer in ask_all(session.client, Locks, ListLocks()):
         for holder in answer.holders:
-            if any(slot.startswith(f"{name}:") for slot in holder.slots):
+            used = holder.kept != "unused"  # else its shard takes the grant back
+            if used and any(slot.startswith(f"{name}:") for slot in holder.slots):
                 raise MisuseError(
                     f"world context {name!r} is not dropped: {holder_line(holder)}; end that lock"
                     " first (enact lock ls)"

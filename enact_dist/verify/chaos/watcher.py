@@ -59,7 +59,7 @@ class Watcher:
         self.locks_left = 0
         for shard, answer in zip(shards, answers, strict=True):
             if isinstance(answer, Locks):
-                self.locks_left += len(answer.holders)
+                self.locks_left += sum(holder.kept != "unused" for holder in answer.holders)
                 self._note_doubts(shard, answer, now_ns)
         self._looks += 1
         if self._looks % COUNTERS_EVERY == 0:
