@@ -177,8 +177,7 @@ class ShardHost:
         self._each_tick: tuple[Callable[[], None], ...] = ()
         self._failure: Exception | None = None
         self._ended = False
-        self._draining = False
-        self._stops_now = False
+        self._draining = self._stops_now = False
         self._rests = threading.Event()
         self._wake = threading.Condition(threading.Lock())
         self._look_again = False
@@ -409,8 +408,7 @@ class ShardHost:
         if self._failure is not None:
             return
         failure = reason if isinstance(reason, Exception) else RuntimeError(repr(reason))
-        self._failure = failure
-        self._ended = True
+        self._failure, self._ended = failure, True
         self._replies.clear()
         self._rests.set()
         _log.critical("shard %s stops: %s", self.name, failure)
