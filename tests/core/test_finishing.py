@@ -61,7 +61,7 @@ def test_expectations_travel_to_their_shards():
     votes = dict(end.votes_to_ask(0))
 
     assert (votes["a"].expects, votes["c"].expects, votes["d"].expects) == ((), EXPECT, EXPECT)
-    assert end.commit(0).expects == EXPECT
+    assert end.commit(0, None, 0).expects == EXPECT
 
 
 def test_only_who_has_not_answered_is_asked_again():
@@ -77,14 +77,14 @@ def test_commit_names_its_participants_and_comes_after_their_promises():
     end = finishing("a", "b", "c")
     end.prepared = {"c": Prepared(LOCK, 70, ()), "b": Prepared(LOCK, 90, ())}
 
-    assert end.commit(80) == Commit(LOCK, TOKENS["a"], WRITE, 90, (), ("b", "c"))
-    assert end.commit(100).seen_stamp_ns == 100
+    assert end.commit(80, None, 0) == Commit(LOCK, TOKENS["a"], WRITE, 90, (), ("b", "c"))
+    assert end.commit(100, None, 0).seen_stamp_ns == 100
     assert end.token == TOKENS["a"]
 
 
 def test_commit_on_one_shard_alone_has_no_participants():
     """It decides by itself, in one step."""
-    assert finishing("b").commit(5) == Commit(LOCK, TOKENS["b"], WRITE, 5)
+    assert finishing("b").commit(5, None, 0) == Commit(LOCK, TOKENS["b"], WRITE, 5)
 
 
 def test_where_something_is_only_expected_the_epoch_stands_for_a_grant():

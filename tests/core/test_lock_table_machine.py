@@ -9,8 +9,7 @@ from hypothesis.stateful import run_state_machine_as_test
 from machine_coverage import Coverage, examples, run_and_cover, settings_of
 from machine_table import ACTS, CLAIMS, NEWCOMERS, THERE, UNREACHABLE, TableMachine
 
-from enact_dist.core.state import grants as tenures
-from enact_dist.core.state import lock_table
+from enact_dist.core.state import lock_table, tenure
 from enact_dist.core.state.lock_table import CONFLICTS, Mode
 
 EXAMPLES = 150
@@ -60,7 +59,7 @@ def mixed_mode_is_forgotten(patch):
     """Reading a column and writing one slot of it counts as reading."""
     join = lock_table.join
     wrong = lambda one, other: Mode.S if join(one, other) is Mode.SIX else join(one, other)  # noqa: E731
-    patch(tenures, "join", wrong)
+    patch(tenure, "join", wrong)
 
 
 def readers_wait_for_readers(patch):
