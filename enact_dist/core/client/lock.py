@@ -32,7 +32,6 @@ from enact_dist.core.client.plan import OF_SESSIONS, Part, Phase, Plan, Reading,
 from enact_dist.core.protocol.checks import NO_PAYLOAD
 from enact_dist.core.protocol.messages import (
     OUTCOME_COMMITTED,
-    Acquire,
     Answer,
     Changed,
     Commit,
@@ -62,13 +61,7 @@ if TYPE_CHECKING:
 
     from enact_dist.core.client.session import ClientSession
     from enact_dist.core.protocol.datum import LockId, Position, Slot
-    from enact_dist.core.protocol.messages import (
-        DatumRead,
-        Holder,
-        Request,
-        SlotVersion,
-        WriteItem,
-    )
+    from enact_dist.core.protocol.messages import DatumRead, Holder, Request, SlotVersion, WriteItem
 
 WAIT_SLICE_NS: Final = 900_000_000
 """How long one call of a waiting lock is parked; below the shard's own limit of 1 s."""
@@ -155,24 +148,15 @@ class MultiLock:
         return [(finishing.primary, commit)]
 
     def _acquire(self, now_ns: int) -> tuple[str, Request]:
-        parts, client = self.parts, self.client
+        parts = self.parts
         part = parts[0] if len(parts) == 1 else first_asking(parts)
         assert part is not None
         left_ns = max(0, self.give_up_ns - now_ns)
         # The hold limit counts from the last grant; earlier ones must outlast the waiting too.
         hold_ns = self.hold_ns if part is parts[-1] else self.hold_ns + left_ns
-        peer = client.peer(part.shard)
-        return part.shard, Acquire(
-            self.lock,
-            peer.epoch,
-            self.plan.placement.version,
-            client.sendings.next(now_ns),
-            part.items,
-            min(self.slice_ns, left_ns),
-            hold_ns,
-            client.seen_stamp_ns,
-            len(parts) == 1 and not self.plan.views,
-            peer.successions,
+        wait_ns = min(self.slice_ns, left_ns)
+        return part.shard, part.acquire(
+            self.lock, self.plan, self.client, now_ns=now_ns, wait_ns=wait_ns, hold_ns=hold_ns
         )
 
     def take_farewells(self) -> list[tuple[str, Request]]:

@@ -19,9 +19,10 @@ from enact_dist.terms import Durability
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
-    from enact_dist.core.protocol.messages import AspectEntry, WorldEntry
+    from enact_dist.core.protocol.messages import AspectEntry, WorldEntry, WriteItem
 
 E = TypeVar("E")
+_STRICTNESS: Final = (Durability.VOLATILE, Durability.OS, Durability.DURABLE)
 
 
 WORLDS_MAX: Final = 4096
@@ -249,6 +250,15 @@ class Catalogue:
     def durability(self, aspect: str) -> Durability:
         """Return what a commit of this (registered) aspect survives."""
         return _DURABILITIES[self.aspects[aspect].durability]
+
+    def strictest(self, writes: Iterable[WriteItem]) -> Durability:
+        """Return what a commit of these must survive: the most that one of its data asks for."""
+        strictest = Durability.VOLATILE
+        for slot, _ in writes:
+            durability = self.durability(slot.aspect)
+            if durability is not strictest:
+                strictest = max(strictest, durability, key=_STRICTNESS.index)
+        return strictest
 
 
 def _world_bytes(world: WorldEntry) -> int:

@@ -86,7 +86,6 @@ if TYPE_CHECKING:
     from enact_dist.core.state.tenure import Tenure
 
 _DELETED: Final = NullReason.DELETED
-_STRICTNESS: Final = (Durability.VOLATILE, Durability.OS, Durability.DURABLE)
 
 
 @dataclass(slots=True)
@@ -259,7 +258,10 @@ class Commits:
 
     def _make_durable(self, commit: _InFlight, *, now_ns: int) -> Iterable[Effect]:
         """Hand the commit to the store, or apply it at once where nothing is to survive."""
-        durability, outcome = self._strictest(commit), commit.outcome
+        outcome = commit.outcome
+        # A decision is relied on by other shards, so it outlasts everything.
+        decided = commit.decision is not None
+        durability = Durability.DURABLE if decided else self._catalogue.strictest(commit.writes)
         if durability is Durability.VOLATILE and not commit.new:
             return self._apply(commit, now_ns=now_ns)
         stamp_ns = outcome.position.stamp_ns
@@ -276,20 +278,6 @@ class Commits:
         return self._persist(
             (*kept, *decision, *forgotten), durability, partial(self._persisted, commit)
         )
-
-    def _strictest(self, commit: _InFlight) -> Durability:
-        """Return what a commit must survive: the most that one of its data asks for.
-
-        A decision is relied on by other shards, so it outlasts everything.
-        """
-        if commit.decision is not None:
-            return Durability.DURABLE
-        strictest = Durability.VOLATILE
-        for slot, _ in commit.writes:
-            durability = self._catalogue.durability(slot.aspect)
-            if durability is not strictest:
-                strictest = max(strictest, durability, key=_STRICTNESS.index)
-        return strictest
 
     def _persisted(self, commit: _InFlight, now_ns: int) -> Iterable[Effect]:
         """The store is done: apply, release and answer."""
