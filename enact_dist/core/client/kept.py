@@ -137,13 +137,16 @@ class Keeping:
         """Return how long the block under a kept grant has lasted; 0 under any other."""
         return now_ns - self.begun_ns if self.begun_ns else 0
 
-    def ends(self, phase: Phase, *, sent: bool) -> bool:
+    def ends(self, phase: Phase, part: Part, *, sent: bool) -> bool:
         """Take in how the lock ends; return whether nothing is left to report to the shard.
 
         Args:
             phase: In which the lock rests.
+            part: What it held.
             sent: Whether its end was begun by messages.
         """
+        if self.grant is not None:
+            self.grant.until_ns = max(self.grant.until_ns, part.until_ns)
         if self.grant is None or phase is Phase.COMMITTED:
             return False
         if sent or phase is not Phase.RELEASED:
@@ -155,7 +158,7 @@ class Keeping:
         self.said, part = said, lock.parts[0]
         if said < PLACES or part.token is None:
             self.grant = None
-        elif self.grant is None:
+        elif self.grant is None and not self.begun_ns:
             self.grant = KeptGrant(
                 self.items,
                 lock.plan,
@@ -167,8 +170,6 @@ class Keeping:
                 part.granted_count,
                 part.until_ns,
             )
-        else:
-            self.grant.until_ns = max(self.grant.until_ns, part.until_ns)
 
     def take_grant(self) -> KeptGrant | None:
         """Return the grant that stays, for its mark to be given back and its cell looked at."""

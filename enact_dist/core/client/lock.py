@@ -361,7 +361,8 @@ class MultiLock:
     def _end(self, phase: Phase) -> None:
         """Rest in `phase`; whatever may still be held or awaited is given back."""
         self.phase = phase
-        if self.keeping is not None and self.keeping.ends(phase, sent=self._finishing is not None):
+        keeping, sent = self.keeping, self._finishing is not None
+        if keeping is not None and keeping.ends(phase, self.parts[0], sent=sent):
             self.client.ended(self)
             return
         if self._finishing is not None:

@@ -139,7 +139,9 @@ class PrepareDesk:
             return
         moved = state.commits.moved_on(message.expects, message.lock)
         if moved is not None:
-            yield from state.commits.changed(tenure, moved, reply_to=reply_to, now_ns=state.now_ns)
+            yield from state.commits.changed(
+                message.lock, tenure, moved, reply_to=reply_to, now_ns=state.now_ns
+            )
             return
         stamp_ns = state.stamps.next(seen_ns=message.seen_stamp_ns, wall_ns=state.wall_ns)
         next_version = state.slots.next_version

@@ -260,6 +260,7 @@ class SessionDesk:
         for tenure in tenures:
             if not tenure.bound:
                 yield from self._state.tenures.take_away(tenure, cause, now_ns=self._state.now_ns)
+            tenure.keepable = False
         self._state.pins.drop_session(session)
         self._state.sessions.forget(session)
         self._state.tenures.session_ended(session)

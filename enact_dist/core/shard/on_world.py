@@ -265,7 +265,7 @@ class WorldDesk:
             return Refused("value", f"{asked}, and stands in cell.toml; take it out there first")
         for tenure in list(state.tenures.kept.by_number.values()):
             if any(item.context == world for item in tenure.items):
-                state.tenures.recall(tenure, now_ns=state.now_ns)
+                state.tenures.kept.recall(tenure, now_ns=state.now_ns)
         for tenure in state.tenures.by_lock.values():
             item = next((item for item in tenure.items if item.context == world), None)
             if item is not None:

@@ -353,7 +353,7 @@ class Shard:
         tenures = self.state.tenures
         tenures.kept.closed = True
         for tenure in list(tenures.kept.by_number.values()):
-            tenures.recall(tenure, now_ns=self.state.now_ns)
+            tenures.kept.recall(tenure, now_ns=self.state.now_ns)
         for tenure in list(self.state.tenures.by_lock.values()):
             if tenure.parked is not None:
                 yield self.state.tenures.waiting(tenure, self.state.now_ns)

@@ -186,7 +186,7 @@ class Commits:
         assert tenure is not None
         moved = self.moved_on(message.expects, lock) if message.expects else None
         if moved is not None:
-            return self.changed(tenure, moved, reply_to=reply_to, now_ns=now_ns)
+            return self.changed(lock, tenure, moved, reply_to=reply_to, now_ns=now_ns)
         stamp_ns = self._stamps.next(seen_ns=message.seen_stamp_ns, wall_ns=wall_ns)
         next_version = self._slots.next_version
         versions = tuple([SlotVersion(slot, next_version(slot)) for slot, _ in message.writes])
@@ -195,7 +195,7 @@ class Commits:
         held_ns = now_ns - tenure.granted_ns
         if tenure.kept:
             session.lane(lock.lane).top = lock.seq
-            held_ns = min(held_ns, message.held_ns)
+            held_ns = max(0, min(held_ns, message.held_ns))
         cause = session.cause(message, versions, stamp_ns, held_ns)
         commit = _InFlight(tenure, message.writes, new, outcome, cause, message.keep, [reply_to])
         if message.participants:
@@ -229,13 +229,13 @@ class Commits:
         return None
 
     def changed(
-        self, tenure: Tenure, moved: SlotVersion, *, reply_to: int, now_ns: int
+        self, lock: LockId, tenure: Tenure, moved: SlotVersion, *, reply_to: int, now_ns: int
     ) -> Iterator[Effect]:
         """End a lock whose expectation does not hold; a repeated request gets the same answer."""
-        answer = Changed(tenure.lock, *moved)
-        session = self._sessions.known(tenure.lock.session)
+        answer = Changed(lock, *moved)
+        session = self._sessions.known(lock.session)
         if session is not None:
-            session.lane(tenure.lock.lane).changed = answer
+            session.lane(lock.lane).changed = answer
         self._counters["commits_changed"] += 1
         yield from self._tenures.remove(tenure, now_ns=now_ns)
         yield Reply(reply_to, answer)
@@ -440,7 +440,7 @@ class Commits:
         assert session is not None
         moved = self.moved_on(message.expects, lock) if message.expects else None
         if moved is not None:
-            return self.changed(tenure, moved, reply_to=reply_to, now_ns=now_ns)
+            return self.changed(lock, tenure, moved, reply_to=reply_to, now_ns=now_ns)
         lane = session.lane(lock.lane)
         lane.validated = (lock, token)
         if tenure.kept:
@@ -467,7 +467,9 @@ class Commits:
         nothing = Position(0, self._shard)
         if recorded is not None:
             kind, position, versions = OUTCOME_COMMITTED, recorded.position, recorded.versions
-        elif message.lock in self._in_flight or (tenure is not None and tenure.committing):
+        elif message.lock in self._in_flight or (
+            tenure is not None and tenure.committing and not tenure.kept
+        ):
             kind, position, versions = OUTCOME_PENDING, nothing, ()
         else:
             lanes = self._sessions.lanes_of(message.lock.session)

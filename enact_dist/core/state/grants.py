@@ -308,13 +308,9 @@ class Tenures:
     def recall_for(self, waiter: Tenure, *, now_ns: int) -> None:
         """Recall the kept grants in the way of a waiter; those that no block uses are over."""
         for claim in self.table.holders_against(waiter.claim):
-            self.recall(self.by_lock[claim.lock], now_ns=now_ns)
-
-    def recall(self, tenure: Tenure, *, now_ns: int) -> None:
-        """Take a grant back if it is kept; the hold limit of a block that uses it begins."""
-        if tenure.kept and not tenure.recalled and not self.kept.recall(tenure):
-            tenure.hold_end_ns = now_ns + tenure.hold_ns
-            heapq.heappush(self._hold_ends, (tenure.hold_end_ns, tenure.lock))
+            tenure = self.by_lock[claim.lock]
+            if tenure.kept:
+                self.kept.recall(tenure, now_ns=now_ns)
 
     def end_block(self, tenure: Tenure, *, keep: bool, now_ns: int) -> tuple[int, Iterable[Effect]]:
         """End a block that ended well: its grant stays, or is over.
@@ -329,7 +325,7 @@ class Tenures:
         """
         told = NOT_KEPT
         if keep and tenure.keepable:
-            told = self.kept.stays(tenure, awaited=self.table.awaited(tenure.claim))
+            told = self.kept.stays(tenure, awaited=self.table.awaited(tenure.claim), now_ns=now_ns)
         if told < PLACES:
             return told, self.remove(tenure, now_ns=now_ns)
         tenure.pins.clear()
@@ -359,10 +355,10 @@ class Tenures:
             yield from self.remove(tenure, now_ns=now_ns)
             return  # no block loses anything
         session = self._sessions.by_id.get(tenure.lock.session)
-        if session is not None and tenure.token is not None:
-            session.lane(tenure.lock.lane).ended = (tenure.lock, cause)
         if tenure.kept:
-            self.kept.taken(tenure, cause)
+            self.kept.taken(tenure, cause)  # its lane has newer locks, with causes of their own
+        elif session is not None and tenure.token is not None:
+            session.lane(tenure.lock.lane).ended = (tenure.lock, cause)
         yield Story("lock.taken", f"{self.told(tenure, now_ns)}: {cause}")
         yield from self.remove(tenure, now_ns=now_ns)
 
@@ -426,13 +422,13 @@ class Tenures:
             tenure = self.by_lock.get(lock)
             if tenure is None or tenure.token is None or tenure.bound:
                 continue
-            if tenure.kept and not tenure.recalled:
-                continue  # no lock waits for it; its hold limit begins when it is recalled
+            if tenure.kept:
+                continue  # its hold limit begins when it is recalled
             if tenure.hold_end_ns > now_ns:
                 heapq.heappush(self._hold_ends, (tenure.hold_end_ns, lock))
             else:
                 over.append(tenure)
-        return over
+        return over + [t for t in self.kept.in_use() if t.hold_end_ns <= now_ns]
 
     def stalled(self, gap_ns: int) -> None:
         """Move every hold limit by the time that the shard itself stood still."""
@@ -442,6 +438,7 @@ class Tenures:
     def next_deadline_ns(self) -> int | None:
         """Return when the next slice or hold limit ends."""
         heads = [heap[0][0] for heap in (self._hold_ends, self._parked_ends) if heap]
+        heads += [tenure.hold_end_ns for tenure in self.kept.in_use()]
         return min(heads, default=None)
 
     def next_lease_end_ns(self, now_ns: int, *, until_ns: int) -> int | None:

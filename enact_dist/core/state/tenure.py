@@ -252,12 +252,13 @@ class KeptGrants:
         """Whether a session keeps a grant here."""
         return session in self._of
 
-    def stays(self, tenure: Tenure, *, awaited: bool) -> int:
+    def stays(self, tenure: Tenure, *, awaited: bool, now_ns: int) -> int:
         """Decide whether a grant stays after a block that ended well.
 
         Args:
             tenure: The grant; bound no more.
             awaited: Whether another lock waits for what it holds.
+            now_ns: The present.
 
         Returns:
             What the answer to the client says; below `PLACES` the grant is over.
@@ -276,7 +277,7 @@ class KeptGrants:
             return NOT_KEPT
         assert tenure.token is not None
         number, session = tenure.token.number, tenure.lock.session
-        told = self.marks.keep(session, number) if self._has_room(session) else NOT_KEPT
+        told = self.marks.keep(session, number) if self._has_room(session, now_ns) else NOT_KEPT
         if told < PLACES:
             self._counters["grants_not_kept"] += 1
             return told
@@ -285,11 +286,14 @@ class KeptGrants:
         self._counters["grants_kept"] += 1
         return told
 
-    def _has_room(self, session: str) -> bool:
-        """Whether one more grant may be kept; the oldest one of a session makes room."""
+    def _has_room(self, session: str, now_ns: int) -> bool:
+        """Whether one more grant may be kept; the oldest idle one of a session makes room."""
         mine = self._of.get(session, {})
         if len(mine) >= KEPT_OF_SESSION_MAX:
-            self.recall(next(iter(mine.values())))
+            for number, tenure in mine.items():
+                if not tenure.committing and not self.marks.used(session, number):
+                    self.recall(tenure, now_ns=now_ns)
+                    break
         return len(mine) < KEPT_OF_SESSION_MAX and len(self.by_number) < KEPT_MAX
 
     def _habit(self, tenure: Tenure) -> _Habit:
@@ -301,12 +305,13 @@ class KeptGrants:
             habit = self._habits[key] = _Habit()
         return habit
 
-    def recall(self, tenure: Tenure) -> bool:
-        """Take a kept grant back for another lock.
+    def recall(self, tenure: Tenure, *, now_ns: int) -> None:
+        """Take a kept grant back, if that was not done before.
 
-        Returns:
-            Whether it is over; else a block uses it, and it ends with that block.
+        It is over, or a block uses it: then it ends with that block, whose hold limit begins.
         """
+        if tenure.recalled:
+            return
         assert tenure.token is not None
         number = tenure.token.number
         habit = self._habit(tenure)
@@ -315,11 +320,10 @@ class KeptGrants:
         if unused and not tenure.committing:
             self._counters["grants_revoked"] += 1
             self._end(tenure)
-            return True
-        tenure.recalled = True
+            return
+        tenure.recalled, tenure.hold_end_ns = True, now_ns + tenure.hold_ns
         self.recalled[number] = tenure
         self._counters["grants_recalled"] += 1
-        return False
 
     def is_unused(self, tenure: Tenure) -> bool:
         """Whether a grant is kept and no block uses it now."""
@@ -333,10 +337,15 @@ class KeptGrants:
             if self.is_unused(tenure):
                 self._end(tenure)
 
+    def in_use(self) -> list[Tenure]:
+        """Return the recalled grants whose block time may end."""
+        return [tenure for tenure in self.recalled.values() if not tenure.committing]
+
     def over(self, tenure: Tenure) -> None:
         """Forget a kept grant that ends, however it does."""
         assert tenure.token is not None
         number, session = tenure.token.number, tenure.lock.session
+        tenure.kept, tenure.recalled = NOT_KEPT, False
         self.marks.over(session, number)
         del self.by_number[number]
         self.recalled.pop(number, None)
@@ -357,7 +366,12 @@ class KeptGrants:
         return self._causes.get(token.number)
 
     def session_ended(self, session: str) -> None:
-        """Forget what is known of a session: its page, and its habits."""
+        """Forget what is known of a session: its page, and its habits.
+
+        What is bound still ends with its commit, and is kept no more.
+        """
+        for tenure in list(self._of.get(session, {}).values()):
+            self.over(tenure)
         self.marks.drop(session)
         for key in [key for key in self._habits if key[0] == session]:
             del self._habits[key]
