@@ -155,8 +155,8 @@ class MultiLock:
         # The hold limit counts from the last grant; earlier ones must outlast the waiting too.
         hold_ns = self.hold_ns if part is parts[-1] else self.hold_ns + left_ns
         wait_ns = min(self.slice_ns, left_ns)
-        return part.shard, part.acquire(
-            self.lock, self.plan, self.client, now_ns=now_ns, wait_ns=wait_ns, hold_ns=hold_ns
+        return part.shard, self.client.acquire(
+            self.lock, self.plan, part, now_ns=now_ns, wait_ns=wait_ns, hold_ns=hold_ns
         )
 
     def take_farewells(self) -> list[tuple[str, Request]]:

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
-from enact_dist.core.protocol.messages import Acquire, Alive, EpochChanged, Welcome
+from enact_dist.core.protocol.messages import Alive, EpochChanged, Welcome
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from enact_dist.core.client.lease_clock import Sendings
-    from enact_dist.core.client.session import ClientSession
-    from enact_dist.core.protocol.datum import LockId, Token
+    from enact_dist.core.protocol.datum import Token
     from enact_dist.core.protocol.messages import Granted, Item, PlacementMap, SlotState
 
 
@@ -64,31 +63,6 @@ class Part:
     granted_count: int = 0
     until_ns: int = 0
     hold_until_ns: int = 0
-
-    def acquire(
-        self,
-        lock: LockId,
-        plan: Plan,
-        client: ClientSession[Any],
-        *,
-        now_ns: int,
-        wait_ns: int,
-        hold_ns: int,
-    ) -> Acquire:
-        """Return the next request for this part of a lock."""
-        peer = client.peer(self.shard)
-        return Acquire(
-            lock,
-            peer.epoch,
-            plan.placement.version,
-            client.sendings.next(now_ns),
-            self.items,
-            wait_ns,
-            hold_ns,
-            client.seen_stamp_ns,
-            len(plan.locks) == 1 and not plan.views,
-            peer.successions,
-        )
 
     def granted(self, answer: Granted, sendings: Sendings, *, ttl_ns: int) -> None:
         """Take the grant of this part, and what it allows to believe."""

@@ -20,6 +20,7 @@ from enact_dist.core.client.own_commits import Unsettled
 from enact_dist.core.client.plan import Phase
 from enact_dist.core.protocol.messages import (
     START,
+    Acquire,
     Alive,
     Answer,
     EpochChanged,
@@ -35,7 +36,7 @@ from enact_dist.core.state.clock import STAMP_NS_MAX
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from enact_dist.core.client.plan import Part
+    from enact_dist.core.client.plan import Part, Plan
     from enact_dist.core.protocol.datum import LockId
     from enact_dist.core.protocol.messages import Prepared, Request
 
@@ -276,6 +277,24 @@ class ClientSession(Generic[L]):
                     lock.lose(cause, asked_of=part)
 
     # ---------------------------------------------------------------- locks
+
+    def acquire(
+        self, lock: LockId, plan: Plan, part: Part, *, now_ns: int, wait_ns: int, hold_ns: int
+    ) -> Acquire:
+        """Return the next request for one part of a lock."""
+        peer = self.peer(part.shard)
+        return Acquire(
+            lock,
+            peer.epoch,
+            plan.placement.version,
+            self.sendings.next(now_ns),
+            part.items,
+            wait_ns,
+            hold_ns,
+            self.seen_stamp_ns,
+            len(plan.locks) == 1 and not plan.views,
+            peer.successions,
+        )
 
     def ended(self, lock: L) -> None:
         """Forget a lock that rests; called by the lock itself."""

@@ -351,15 +351,13 @@ class Tenures:
     def take_away(self, tenure: Tenure, cause: str, *, now_ns: int) -> Iterator[Effect]:
         """End a tenure against its holder's will, remembering why for its next message."""
         assert not tenure.bound
-        if self.kept.is_unused(tenure):
-            yield from self.remove(tenure, now_ns=now_ns)
-            return  # no block loses anything
         session = self._sessions.by_id.get(tenure.lock.session)
         if tenure.kept:
             self.kept.taken(tenure, cause)  # its lane has newer locks, with causes of their own
         elif session is not None and tenure.token is not None:
             session.lane(tenure.lock.lane).ended = (tenure.lock, cause)
-        yield Story("lock.taken", f"{self.told(tenure, now_ns)}: {cause}")
+        if not self.kept.is_unused(tenure):  # else no block loses anything
+            yield Story("lock.taken", f"{self.told(tenure, now_ns)}: {cause}")
         yield from self.remove(tenure, now_ns=now_ns)
 
     def describe(self, tenure: Tenure, now_ns: int) -> Holder:
