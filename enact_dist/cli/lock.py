@@ -64,13 +64,18 @@ def held(text: str) -> tuple[str, str, str, str]:
 
 VERBS: Final = (
     Verb(
-        "ls", "list who holds what and who waits for whom", "list_locks",
+        "ls",
+        "list who holds what and who waits for whom; `kept` is a grant that stays between two locks"
+        " and ends when another process asks, `kept, used` one that a block uses, `recalled` the"
+        " same while another lock waits",
+        "list_locks",
         "enact lock ls",
         READER,
         cell=LOOKS,
         columns=("lock", "shard", "who", "state", "mode", "age", "lease left", "hold left", "data",
                  "waits for"),
         empty="no lock is held or awaited",
+        page="kept_grants",
     ),
     Verb(
         "hold",
@@ -171,7 +176,7 @@ def _row(lock: LockInfo, known: dict[tuple[str, int], LockInfo]) -> tuple[object
         lock.number,
         lock.shard,
         who(lock),
-        "held" if lock.granted else "waits",
+        lock.state,
         lock.modes,
         shown_s(lock.age_s),
         shown_s(lock.lease_left_s),
@@ -285,7 +290,7 @@ def break_lock(cell: Cell, options: argparse.Namespace) -> Output:
     broken = cell.break_lock(number, shard=shard, reason=reason)
     if broken is None:
         raise MisuseError(f"shard {shard} knows no lock {number}; see enact lock ls")
-    state = "held" if broken.granted else "awaited"
+    state = ("kept" if broken.kept == "unused" else "held") if broken.granted else "awaited"
     return Output(broken, f"broke lock {number} on {shard}, {state} by {who(broken)}: {reason}")
 
 

@@ -116,6 +116,9 @@ class LockInfo:
         number: What `Cell.break_lock` takes; unique within the shard's epoch.
         modes: "read", "write" or both.
         waits_for: Numbers of the locks that block it.
+        kept: How a grant is used that stays with its session between two blocks: "unused" (it ends
+            as soon as somebody asks for its data), "used", or "recalled" (used, and over with that
+            block); "" of any other lock.
     """
 
     shard: str
@@ -131,6 +134,17 @@ class LockInfo:
     hold_left_s: float
     slots: tuple[str, ...]
     waits_for: tuple[int, ...]
+    kept: str = ""
+
+    @property
+    def state(self) -> str:
+        """How it stands, as `enact lock ls` shows it; "kept" is in nobody's way."""
+        if not self.granted:
+            return "waits"
+        return _STATES.get(self.kept, "held")
+
+
+_STATES: Final = {"unused": "kept", "used": "kept, used", "recalled": "recalled"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -279,6 +293,7 @@ def lock_info(shard: str, holder: Holder) -> LockInfo:
         holder.hold_left_ns / 1e9,
         holder.slots,
         holder.waits_for,
+        holder.kept,
     )
 
 

@@ -250,9 +250,10 @@ class LockDesk:
         elif tenure is not None:
             self._prepares.hint(lock)
         elif state.tenures.kept.has(lock.session):
-            lane = state.sessions.by_id[lock.session].lanes.get(lock.lane)
-            if lane is not None and lane.top < lock.seq:
-                lane.top = lock.seq  # a late copy of its commit under a kept grant is fenced
+            session = state.sessions.by_id[lock.session]
+            if lock.lane in session.lanes or len(session.lanes) < LANES_MAX:
+                lane = session.lane(lock.lane)
+                lane.top = max(lane.top, lock.seq)  # a late copy of its commit is fenced
         if lock.session in state.pins.by_session:
             state.pins.drop(lock)
         effects += (Reply(reply_to, Released()),)

@@ -1,6 +1,13 @@
 """Locks under a grant that this session keeps: marks its use, and looks whether it lives.
 
-The order of these steps is the rule: see `core.client.kept`.
+::
+
+    begin    take, mark, look at the cell, begin_kept       leave    mark back, look again, put back
+
+Rules a change must keep
+  * The order of these steps; see `core.client.kept`.
+  * The time from which a hold limit counts is taken before the mark: a recall comes after the mark.
+  * A lock begins only under a mark that `repair` has not given back meanwhile; both hold the mutex.
 """
 
 from __future__ import annotations
@@ -14,7 +21,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from enact_dist.core.client.client import Client
-    from enact_dist.core.client.kept import Keeping
     from enact_dist.core.client.lock import MultiLock
     from enact_dist.core.protocol.messages import Item
     from enact_dist.link.memory.payload_client import SharedPayloads
@@ -33,13 +39,14 @@ class WantedLock(NamedTuple):
 
 
 class KeptUses:
-    """The use of the kept grants of one session.  Thread-safe.
+    """What touches the pages of marks when locks of one session begin and end.
 
     Args:
         core: The session.
-        payloads: Where its pages are.
+        payloads: Has the pages.
         mutex: Guards the session.
         now_ns: The session's clock.
+        counters: Those of the session.
     """
 
     def __init__(
@@ -48,9 +55,10 @@ class KeptUses:
         payloads: SharedPayloads,
         mutex: threading.RLock,
         now_ns: Callable[[], int],
+        counters: dict[str, int],
     ) -> None:
-        self._core, self._payloads = core, payloads
-        self._mutex, self._now_ns = mutex, now_ns
+        self._core, self._payloads, self._mutex = core, payloads, mutex
+        self._now_ns, self._counters = now_ns, counters
 
     def begin(self, lane: int, asked: WantedLock) -> MultiLock | None:
         """Begin a lock under a grant that is kept; None if it has to be asked for."""
@@ -62,15 +70,19 @@ class KeptUses:
         page = self._payloads.page(grant.shard, grant.token.epoch)
         if page is None:
             return None
-        lock, number = None, grant.token.number
-        page.mark(number)
+        lock, number, now_ns, hold_ns = None, grant.token.number, self._now_ns(), asked.hold_ns
         try:
+            page.mark(number)
             if page.lives(grant.place, number):
                 with self._mutex:
-                    now_ns, hold_ns = self._now_ns(), asked.hold_ns
-                    lock = self._core.begin_kept(lane, grant, now_ns=now_ns, hold_ns=hold_ns)
+                    if number in page.marked:
+                        lock = self._core.begin_kept(lane, grant, now_ns=now_ns, hold_ns=hold_ns)
                     if lock is not None:
                         asked.begun.append(lock)
+                        used = self._counters.get("grants_used_again", 0)
+                        self._counters["grants_used_again"] = used + 1
+        except OSError as error:
+            self._payloads.keep_no_more(grant.shard, error)
         finally:
             if lock is None:
                 page.unmark(number)
@@ -92,19 +104,44 @@ class KeptUses:
         with self._mutex:
             return lock.finish_kept(self._now_ns())
 
-    def leave(self, lock: MultiLock, keeping: Keeping) -> None:
+    def leave(self, lock: MultiLock) -> None:
         """Give the mark of a block back, and keep its grant if that still lives."""
-        part, grant = lock.parts[0], keeping.take_grant()
-        page = self._payloads.page(part.shard, part.token.epoch) if part.token else None
-        if part.token is None or page is None:
-            if keeping.said == PROVE:
-                self._payloads.prove(part.shard)
+        keeping, part = lock.keeping, lock.parts[0]
+        if keeping is None or part.token is None:
             return
-        number = part.token.number
-        if keeping.begun_ns:
-            keeping.begun_ns = 0
-            page.unmark(number)
-        if grant is not None and page.lives(grant.place, number):
-            self._core.kept.put_back(grant)
-        elif grant is not None:
-            lock.farewells.append((part.shard, Release(grant.origin)))
+        grant, number = keeping.take_grant(), part.token.number
+        page = self._payloads.page(part.shard, part.token.epoch)
+        try:
+            if page is not None and keeping.begun_ns:
+                page.unmark(number)
+                keeping.begun_ns = 0
+        finally:
+            if page is not None and keeping.begun_ns:  # interrupted
+                page.unmark(number)
+        if keeping.said == PROVE:
+            self._payloads.prove(part.shard)
+        elif page is not None and grant is not None:
+            if page.lives(grant.place, number):
+                self._core.kept.put_back(grant)
+            else:
+                lock.farewells.append((part.shard, Release(grant.origin)))
+
+    def repair(self) -> None:
+        """Give back the marks that no lock has: an interrupt has cut off its end.
+
+        Without this their grants could not be revoked for as long as the session lives.
+        """
+        pages = self._payloads.pages()
+        if not any(page.marked for _, page in pages):
+            return
+        with self._mutex:
+            used = {
+                (part.shard, part.token.number)
+                for lock in self._core.live_locks()
+                for part in lock.parts
+                if part.token is not None
+            }
+            for shard, page in pages:
+                for number in page.marked.copy():
+                    if (shard, number) not in used:
+                        page.unmark(number)

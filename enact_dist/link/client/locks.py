@@ -119,7 +119,7 @@ class CellClient(SessionClient):
             kept = self._kept.begin(lane, asked) if keep in self.core.kept.by_items else None
             return kept or self._ask(lane, asked)
         except BaseException:
-            self._release_of(lane)
+            self._release_of(lane, begun)
             if begun:
                 self.release(begun[-1])
             else:
@@ -156,7 +156,7 @@ class CellClient(SessionClient):
         waited_s = (self._now_ns() - started_ns) / 1e9
         raise not_granted(lock, waited_s, self.carrier.endpoint_of, asked.items)
 
-    def _release_of(self, lane: int) -> None:
+    def _release_of(self, lane: int, begun: list[MultiLock]) -> None:
         """Release the lock of a lane, even one that an interrupt kept from being recorded.
 
         Otherwise keep-alives would name it forever, and a lost release would never be repaired.
@@ -164,6 +164,8 @@ class CellClient(SessionClient):
         with self._mutex:
             for lock in self.core.live_locks():
                 if lock.lock.lane == lane:
+                    if lock not in begun:
+                        begun.append(lock)
                     lock.release()
 
     def _begins_anew(self, lock: MultiLock, attempt: int) -> bool:
@@ -387,7 +389,7 @@ class CellClient(SessionClient):
                 with self._mutex:
                     lock.release()
             if lock.keeping is not None:
-                self._kept.leave(lock, lock.keeping)
+                self._kept.leave(lock)
             if lock.farewells:
                 self._say_farewell(lock)
         finally:

@@ -119,7 +119,7 @@ class SessionClient:
             weakly(self.count),
             inside=carrier.inside,
         )
-        self._kept = KeptUses(client, self.payloads, self._mutex, now_ns)
+        self._kept = KeptUses(client, self.payloads, self._mutex, now_ns, self.counters)
         self._further = FurtherShards(carrier, client.placement, now_ns, weakly(self.count), doubts)
         self._renewer: threading.Thread | None = None
         if keep_alive:
@@ -469,6 +469,7 @@ class SessionClient:
 
         A shard that is known to be away is asked less and less often.
         """
+        self._kept.repair()
         due = self.renewal.due()
         with self._mutex:
             now_ns = self._now_ns()

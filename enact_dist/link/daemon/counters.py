@@ -49,8 +49,14 @@ OF_A_SHARD: Final[dict[str, Figure]] = {
     "commits": Figure("commits applied here"),
     "bytes_written": Figure(f"bytes of data in these commits: {BODIES}"),
     "bytes_fetched": Figure("bytes that clients fetched in slices"),
-    "locks_granted": Figure("locks granted"),
+    "locks_granted": Figure("locks granted; those that used a kept grant are not counted"),
     "locks_validated": Figure("locks without a write here, confirmed when they ended"),
+    "grants_kept": Figure("grants that stayed with their session, for its next locks of the data"),
+    "grants_not_kept": Figure("grants that could not stay: no page of marks, or no room in it"),
+    "grants_revoked": Figure("kept grants that ended unused, because somebody asked for the data"),
+    "grants_recalled": Figure(
+        "kept grants in use when somebody asked; each ended with the block that used it"
+    ),
     "lock_waits": Figure(
         "locks that had to wait", "if too many: hold locks for less time, or use View"
     ),
@@ -232,6 +238,12 @@ OF_A_CONNECTION: Final[dict[str, Figure]] = {
     ),
     "keep_alives_failed": Figure("invalid answers to keep-alives", "see the log"),
     "keep_alives_unanswered": Figure("keep-alives that got no answer in time", _NETWORK),
+    "grants_used_again": Figure("locks that needed no grant: they used one that was kept"),
+    "pages_of_grants_failed": Figure(
+        "shards whose page of marks cannot be used here, so that no grant of theirs is kept",
+        "see the log; kept grants need file locks in the shared folder"
+        " (enact_dist/docs/kept_grants.md)",
+    ),
     "releases_unsent": Figure(
         "releases that could not be sent; the thread's next lock replaces them"
     ),

@@ -191,19 +191,34 @@ class SharedPayloads:
         shared = self._shards.get(shard)
         return shared.page if shared is not None and shared.epoch == epoch else None
 
+    def pages(self) -> list[tuple[str, ClientPage]]:
+        """Return the pages of this session, each with its shard."""
+        shared = list(self._shards.items())
+        return [(shard, each.page) for shard, each in shared if each.page is not None]
+
     def prove(self, shard: str) -> None:
-        """Open this session's page, as its shard has asked; without it, keep no grants there."""
+        """Open this session's page, as its shard has asked; without it, keep no grants there.
+
+        A shard that has forgotten this session meanwhile has made another one.
+        """
         with self._mutex:
             shared = self._folder(shard)
-            if shared is None or shared.page is not None or shared.folder is None:
+            folder = shared.folder if shared is not None and shared.keeps else None
+            if shared is None or folder is None:
                 return
-            folder = shared.folder
             try:
-                shared.page = ClientPage(folder.descriptor, folder.owner, self._session)
+                if shared.page is None or not shared.page.is_in(folder.descriptor, self._session):
+                    shared.page = ClientPage(folder.descriptor, folder.owner, self._session)
             except OSError as error:
-                shared.keeps = False
-                self._count("pages_of_grants_failed")
-                _log.info("no grants of shard %s are kept: %s", shard, error)
+                self.keep_no_more(shard, error)
+
+    def keep_no_more(self, shard: str, error: OSError) -> None:
+        """Keep no grants of one start of a shard any more."""
+        shared = self._shards.get(shard)
+        if shared is not None:
+            shared.keeps = False
+        self._count("pages_of_grants_failed")
+        _log.info("no grants of shard %s are kept: %s", shard, error)
 
     def leave_pages(self) -> None:
         """Close the pages that a forked child has inherited, without giving marks back."""

@@ -20,6 +20,7 @@ Rules that a change must keep:
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import fcntl
 import hmac
@@ -40,6 +41,8 @@ SHARED_FOLDER_VARIABLE: Final = "ENACT_SHARED_FOLDER"
 MEMORY: Final = Path("/dev/shm")  # noqa: S108 - the kernel's folder, not a temporary file
 NONCE: Final = "nonce"
 NONCE_BYTES: Final = 16
+PAGES: Final = "uses-"
+"""So begin the names of the pages on which clients see which of their grants live (`use_marks`)."""
 NAME_BYTES_MAX: Final = 200
 """Longest name of a folder; names that a shard sends are checked against it."""
 PART_CHARACTERS_MAX: Final = 60
@@ -203,9 +206,27 @@ def _sweep(root: int, path: Path) -> None:
             continue
         try:
             if _is_left_behind(opened, found):
+                with contextlib.suppress(OSError):
+                    _clear_pages(opened)
                 shutil.rmtree(path / entry, ignore_errors=True)
         finally:
             os.close(opened)
+
+
+def _clear_pages(folder: int) -> None:
+    """Clear the pages of a start that is over, before its folder is removed.
+
+    Its clients may not have heard of that, and what they have mapped stays.  Data that were lost
+    with it must not be read under its grants once the next start shows that they are lost.
+    """
+    for name in os.listdir(folder):
+        if name.startswith(PAGES):
+            flags = os.O_WRONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+            page = os.open(name, flags, dir_fd=folder)
+            try:
+                os.pwrite(page, bytes(os.fstat(page).st_size), 0)
+            finally:
+                os.close(page)
 
 
 def _is_left_behind(folder: int, found: os.stat_result) -> bool:

@@ -19,15 +19,17 @@ keeps it from being empty.
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import logging
-import mmap
 import os
 import struct
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.messages import NOT_KEPT, PLACES, PROVE
 from enact_dist.core.state.tenure import KEPT_OF_SESSION_MAX
+from enact_dist.link.memory.maps import body_of, map_file
+from enact_dist.link.memory.shared_folder import PAGES
 
 if TYPE_CHECKING:
     from enact_dist.core.state.tenure import KeptGrants
@@ -35,10 +37,9 @@ if TYPE_CHECKING:
 
 RETAIN_VARIABLE: Final = "ENACT_RETAIN"
 """With the value 0 this process keeps no grants, as a client and as a shard."""
-_CELL: Final = struct.Struct("=Q")
-PAGE_BYTES: Final = KEPT_OF_SESSION_MAX * _CELL.size
+PAGE_BYTES: Final = KEPT_OF_SESSION_MAX * 8
 _LOCK: Final = struct.Struct("hhqqi4x")  # struct flock of 64-bit Linux
-_PROOF: Final = 0
+PROOF: Final = 0
 """The byte that a client keeps locked."""
 
 _log = logging.getLogger("enact.link")
@@ -49,22 +50,43 @@ def retains() -> bool:
     return os.environ.get(RETAIN_VARIABLE, "") != "0"
 
 
+def _cells_of(descriptor: int, *, writable: bool) -> memoryview:
+    """Map a page; each cell is read and written whole, by one instruction.
+
+    Half a number that is being written could be that of an older grant.
+    """
+    return body_of(map_file(descriptor, PAGE_BYTES, writable=writable)).cast("Q")
+
+
 def page_name(session: str) -> str:
     """Return the name of a session's page in the folder."""
-    return f"uses-{session}"
+    return f"{PAGES}{session}"
 
 
-class _ShardPage:
+class ShardPage:
     """One session's page, as the shard has it."""
 
     __slots__ = ("cells", "descriptor", "free", "places", "proven")
 
     def __init__(self, descriptor: int) -> None:
         self.descriptor = descriptor
-        self.cells = mmap.mmap(descriptor, PAGE_BYTES)
+        self.cells = _cells_of(descriptor, writable=True)
         self.places: dict[int, int] = {}
         self.free = list(range(KEPT_OF_SESSION_MAX))
         self.proven = False
+
+    def put(self, number: int) -> int:
+        """Put a grant's number into a free cell; return which."""
+        place = self.places[number] = self.free.pop()
+        self.set(place, number)
+        return place
+
+    def clear(self, number: int) -> None:
+        """Clear a grant's cell; another grant may have it."""
+        place = self.places.pop(number, None)
+        if place is not None:
+            self.set(place, 0)
+            self.free.append(place)
 
     def locked(self, byte: int) -> bool:
         """Whether the client has locked a byte."""
@@ -73,8 +95,12 @@ class _ShardPage:
         kind: int = _LOCK.unpack(found)[0]
         return kind != fcntl.F_UNLCK
 
+    def set(self, place: int, number: int) -> None:
+        """Set a cell; 0 clears it."""
+        self.cells[place] = number
+
     def close(self) -> None:
-        self.cells.close()
+        """Let the file go."""
         os.close(self.descriptor)
 
 
@@ -83,7 +109,7 @@ class ShardMarks:
 
     def __init__(self, folder: SharedFolder) -> None:
         self._folder = folder
-        self._pages: dict[str, _ShardPage | None] = {}
+        self._pages: dict[str, ShardPage | None] = {}
 
     def keep(self, session: str, number: int) -> int:
         """Put a grant's number into a free cell of its session's page."""
@@ -93,60 +119,62 @@ class ShardMarks:
                 self._pages[session] = self._made(session)
                 return PROVE if self._pages[session] is not None else NOT_KEPT
             return NOT_KEPT
-        page.proven = page.proven or page.locked(_PROOF)
+        page.proven = page.proven or page.locked(PROOF)
         if not page.proven or not page.free:
             return NOT_KEPT if page.proven else PROVE
-        place = page.places[number] = page.free.pop()
-        _CELL.pack_into(page.cells, place * _CELL.size, number)
-        return PLACES + place
+        return PLACES + page.put(number)
 
-    def _made(self, session: str) -> _ShardPage | None:
+    def _made(self, session: str) -> ShardPage | None:
         """Make a session's page; None if there is no room for it, or no such locks."""
         folder, name = self._folder, page_name(session)
+        if folder.descriptor < 0:
+            return None
         flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
         try:
             descriptor = os.open(name, flags, 0o600, dir_fd=folder.descriptor)
             try:
                 os.fchmod(descriptor, folder.access.draft_mode)
                 os.posix_fallocate(descriptor, 0, PAGE_BYTES)
-                page = _ShardPage(descriptor)
-                page.locked(_PROOF)
+                page = ShardPage(descriptor)
+                page.locked(PROOF)
             except BaseException:
                 os.close(descriptor)
+                self._unlink(session)
                 raise
         except OSError as error:
             _log.info("no grants are kept for session %s: %s", session[:8], error)
             return None
         return page
 
-    def _clear(self, session: str, number: int) -> _ShardPage:
-        page = self._pages[session]
-        assert page is not None
-        place = page.places.pop(number, None)
-        if place is not None:
-            _CELL.pack_into(page.cells, place * _CELL.size, 0)
-            page.free.append(place)
-        return page
-
     def recall(self, session: str, number: int) -> bool:
         """Clear a grant's cell, then return whether no block uses it."""
-        return not self._clear(session, number).locked(number)
+        self.over(session, number)
+        return not self.used(session, number)
 
     def used(self, session: str, number: int) -> bool:
         """Whether a block uses the grant now."""
-        page = self._pages[session]
+        page = self._pages.get(session)
         return page is not None and page.locked(number)
 
     def over(self, session: str, number: int) -> None:
-        """Clear a grant's cell; another grant may have it."""
-        self._clear(session, number)
+        """Clear a grant's cell; another grant may have it.
+
+        A session that has ended has none: a commit of it may still be on its way to the disk.
+        """
+        page = self._pages.get(session)
+        if page is not None:
+            page.clear(number)
 
     def drop(self, session: str) -> None:
         """Forget the page of a session that has ended."""
         page = self._pages.pop(session, None)
         if page is not None:
             page.close()
-            if self._folder.descriptor >= 0:
+            self._unlink(session)
+
+    def _unlink(self, session: str) -> None:
+        if self._folder.descriptor >= 0:
+            with contextlib.suppress(FileNotFoundError):
                 os.unlink(page_name(session), dir_fd=self._folder.descriptor)
 
 
@@ -161,13 +189,18 @@ class ClientPage:
 
     Closed with its last reference; a mark that it still has is given up with it.
 
+    Attributes:
+        marked: The grants whose marks it may have.
+
     Raises:
         OSError: It cannot be opened, mapped or locked here.
     """
 
-    __slots__ = ("_cells", "descriptor")
+    __slots__ = ("_cells", "descriptor", "marked")
 
     def __init__(self, folder: int, owner: int, session: str) -> None:
+        self.marked: set[int] = set()
+        self._cells: memoryview | None = None
         flags = os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
         self.descriptor = -1
         descriptor = os.open(page_name(session), flags, dir_fd=folder)
@@ -175,12 +208,12 @@ class ClientPage:
             found = os.fstat(descriptor)
             if found.st_uid != owner or found.st_size != PAGE_BYTES:
                 raise OSError(f"{page_name(session)} is no page of the shard's user {owner}")
-            self._cells = mmap.mmap(descriptor, PAGE_BYTES, mmap.MAP_SHARED, mmap.PROT_READ)
+            self._cells = _cells_of(descriptor, writable=False)
             self.descriptor = descriptor
-            self.mark(_PROOF)
+            self._lock(fcntl.F_WRLCK, PROOF)
         except BaseException:
-            os.close(descriptor)
-            self.descriptor = -1
+            self.descriptor = descriptor
+            self.close()
             raise
 
     def __del__(self) -> None:
@@ -188,21 +221,32 @@ class ClientPage:
 
     def mark(self, number: int) -> None:
         """Show that a block uses a grant."""
-        asked = _LOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, number, 1, 0)
-        fcntl.fcntl(self.descriptor, fcntl.F_OFD_SETLK, asked)
+        self.marked.add(number)
+        self._lock(fcntl.F_WRLCK, number)
 
     def unmark(self, number: int) -> None:
-        """Show that no block uses it any more."""
-        asked = _LOCK.pack(fcntl.F_UNLCK, os.SEEK_SET, number, 1, 0)
+        """Show that no block uses it any more; a failure is repaired later."""
+        with contextlib.suppress(OSError):
+            self._lock(fcntl.F_UNLCK, number)
+            self.marked.discard(number)
+
+    def _lock(self, kind: int, byte: int) -> None:
+        asked = _LOCK.pack(kind, os.SEEK_SET, byte, 1, 0)
         fcntl.fcntl(self.descriptor, fcntl.F_OFD_SETLK, asked)
 
     def lives(self, place: int, number: int) -> bool:
         """Whether a grant is not over; looked at after its mark was taken or given back."""
-        found: int = _CELL.unpack_from(self._cells, place * _CELL.size)[0]
-        return found == number
+        cells = self._cells
+        return cells is not None and cells[place] == number
+
+    def is_in(self, folder: int, session: str) -> bool:
+        """Whether it is still the page that its shard has in the folder."""
+        there = os.stat(page_name(session), dir_fd=folder, follow_symlinks=False)
+        return os.path.samestat(there, os.fstat(self.descriptor))
 
     def close(self) -> None:
-        """Close the page; idempotent.  In a forked child this leaves the parent's marks."""
+        """Close the page; idempotent.  In a forked child this leaves the parent's marks to it."""
+        self._cells = None
         descriptor, self.descriptor = self.descriptor, -1
         if descriptor >= 0:
             os.close(descriptor)
