@@ -8,7 +8,7 @@ import signal
 import time
 
 import pytest
-from kept_parts import (
+from kept_processes import (
     RETAINER,
     Waiting,
     heard,

@@ -13,14 +13,14 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from kept_parts import RETAINER, heard, keep, kept_of, slot, used_again
+from kept_processes import RETAINER, heard, keep, kept_of, slot, used_again
 from socket_parts import CUP, add_one, counters
 
 from enact_dist import Aspect, Durability, Entity, Lock, Read, Write, connect
 from enact_dist.core.protocol.messages import Goodbye
 from enact_dist.core.state import tenure
 from enact_dist.errors import EnactError, LeaseLostError
-from enact_dist.link.client import kept_grants, locks
+from enact_dist.link.client import kept, locks
 from enact_dist.link.memory import payload_client, use_marks
 from enact_dist.link.memory.use_marks import ClientPage, page_name
 from enact_dist.link.store.store import Store
@@ -268,7 +268,7 @@ LOOKS = {"RESUME", "CALL", "CALL_KW", "CALL_FUNCTION_EX", "JUMP_BACKWARD"}
 
 def interrupted(act, number):
     """Call `act` and interrupt it the so many-th time that it could be; return whether it could."""
-    files = {kept_grants.__file__, locks.__file__, use_marks.__file__}
+    files = {kept.__file__, locks.__file__, use_marks.__file__}
     left, before = number, {}
 
     def local(frame, event, _):
