@@ -63,14 +63,19 @@ _ANSWERS = {
         a.count_seen,
         frozenset((grant.lock, grant.hold_left_ns) for grant in a.grants),
     ),
-    messages.Committed: lambda a: ("committed", a.lock, _pairs(a.versions)),
+    messages.Committed: lambda a: (
+        "committed",
+        a.lock,
+        _pairs(a.versions),
+        a.kept >= messages.PLACES,
+    ),
     messages.Fenced: lambda a: ("fenced", a.lock),
     messages.Changed: lambda a: ("changed", a.lock, a.slot, a.version),
     messages.Prepared: lambda a: ("prepared", a.lock, _pairs(a.versions)),
     messages.Finished: lambda a: ("finished", a.lock),
     messages.Resolved: lambda a: ("resolved", a.lock, a.kind),
     messages.OutcomeIs: lambda a: ("outcome", a.lock, a.kind, _pairs(a.versions)),
-    messages.Valid: lambda a: ("valid", a.lock),
+    messages.Valid: lambda a: ("valid", a.lock, a.kept >= messages.PLACES),
     messages.Broken: lambda a: ("broken", a.found),
     messages.Viewed: lambda a: ("viewed", a.lock, _shown(a.states)),
     messages.Surveyed: lambda a: ("surveyed", _surveyed(a.states)),
@@ -78,7 +83,7 @@ _ANSWERS = {
     messages.Gone: lambda a: ("gone", a.slot, a.version),
     messages.Locks: lambda a: (
         "locks",
-        tuple(sorted((h.number, h.lock, h.granted) for h in a.holders)),
+        tuple(sorted((h.number, h.lock, h.granted, h.kept) for h in a.holders)),
     ),
 }
 _FACTS = {

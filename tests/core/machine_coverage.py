@@ -63,6 +63,8 @@ def run_and_cover(machine: type[RuleBasedStateMachine], count: int, *tables: Cov
     for _ in range(ROUNDS_MORE):
         if all(table.rarest >= wanted for table in tables):
             break
+        if hasattr(machine, "owed"):
+            machine.owed = [cell for table in tables for cell in table.owed(wanted)]
         run_state_machine_as_test(machine, settings=settings_of(count // ROUND_SHARE))
     return [problem for table in tables for problem in table.problems(wanted)]
 
@@ -108,6 +110,11 @@ class Coverage:
                 elif cell not in self.unreachable and hits < wanted:
                     found.append(f"{cell} was met {hits} times of {wanted}")
         return found
+
+    def owed(self, wanted: int) -> list[tuple[str, str]]:
+        """Return the cells that can be met and were met too seldom."""
+        cells = [(state, event) for state in self.states for event in self.events]
+        return [c for c in cells if c not in self.unreachable and self.hits[c] < wanted]
 
     @property
     def rarest(self) -> int:

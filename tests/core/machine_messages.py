@@ -149,6 +149,30 @@ class Plans:
     def commit(self, lock, pick):
         return Commit(lock, self.token(lock), self.writes(lock, pick), self.seen_ns(pick))
 
+    def keep(self, lock, pick):
+        """Commits and asks to keep the grant."""
+        return replace(self.commit(lock, pick), keep=True)
+
+    def use(self, lock, later, pick):
+        """A later lock commits under the grant of this one, and mostly asks to keep it."""
+        keep, held_ns = pick.below(8) > 0, pick.below(3) * MS
+        expects = self.expects(pick) if pick.below(6) == 0 else ()
+        writes, token = self.writes(lock, pick), self.token(lock)
+        return Commit(later, token, writes, self.seen_ns(pick), expects, keep=keep, held_ns=held_ns)
+
+    def look(self, lock, later, pick):
+        """A later lock asks whether the grant of this one is still held."""
+        expects = self.expects(pick) if pick.below(6) == 0 else ()
+        return Validate(later, self.token(lock), expects, pick.below(8) > 0)
+
+    def late_use(self, lock, pick):
+        """A lock that its lane has left behind, or just reached, commits or asks under a token."""
+        lane = pick.below(2)
+        known = self.pair.reference.lanes.get(lock.session, {}).get(lane)
+        seq = max(1, (known.top if known else 0) - pick.below(3))
+        late = LockId(lock.session, lane, seq)
+        return self.look(lock, late, pick) if pick.below(4) == 0 else self.use(lock, late, pick)
+
     def decide(self, lock, pick):
         writes, seen_ns = self.writes(lock, pick), self.seen_ns(pick)
         return Commit(lock, self.token(lock), writes, seen_ns, (), ("far",))

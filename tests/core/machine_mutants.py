@@ -7,8 +7,9 @@ assertions are off meanwhile.
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
-from enact_dist.core.protocol.messages import Fenced, Finished, Prepared
+from enact_dist.core.protocol.messages import NOT_KEPT, Fenced, Finished, Prepared
 from enact_dist.core.protocol.records import Content, Persist, Reply
 from enact_dist.core.shard.on_lock import LockDesk
 from enact_dist.core.shard.on_prepare import PrepareDesk
@@ -21,7 +22,7 @@ from enact_dist.core.state.grants import Tenures
 from enact_dist.core.state.history import History
 from enact_dist.core.state.sessions import SessionState, SessionTable
 from enact_dist.core.state.slots import SlotMap
-from enact_dist.core.state.tenure import Tenure
+from enact_dist.core.state.tenure import KeptGrants, Tenure
 from enact_dist.terms import NullReason
 
 
@@ -273,7 +274,70 @@ def shows_another_stamp(patch):
     patch(SlotMap, "captured", wrong)
 
 
+def any_seq_under_a_kept_grant(patch):
+    """A late copy is taken for a new block: what it was built on may be gone."""
+    fence = Commits._fence
+
+    def wrong(self, lock, token, tenure):
+        kept = tenure.kept if tenure is not None else NOT_KEPT
+        if kept:
+            tenure.kept = NOT_KEPT
+        answer = fence(self, lock, token, tenure)
+        if kept:
+            tenure.kept = kept
+        return answer
+
+    patch(Commits, "_fence", wrong)
+
+
+def keeps_though_another_waits(patch):
+    """Whoever waited when the grant stayed is never granted."""
+    stays = KeptGrants.stays
+    wrong = lambda self, tenure, **how: stays(self, tenure, **(how | {"awaited": False}))  # noqa: E731
+    patch(KeptGrants, "stays", wrong)
+
+
+def repeated_answer_says_that_it_is_over(patch):
+    """A client that heard the first answer not at all forgets a grant that lives."""
+    patch(KeptGrants, "told", lambda _self, _lock, _token: NOT_KEPT)
+
+
+def nothing_is_revoked(patch):
+    """Whoever comes to wait for an idle grant waits for its next block."""
+    patch(Tenures, "recall_for", lambda _self, _waiter, **_: None)
+
+
+def cell_is_not_cleared(patch):
+    """A grant that ended stays in its cell, and is believed in."""
+    over = KeptGrants.over
+
+    def wrong(self, tenure):
+        marks, self.marks = self.marks, SimpleNamespace(over=lambda *_: None)
+        over(self, tenure)
+        self.marks = marks
+
+    patch(KeptGrants, "over", wrong)
+
+
+def revokes_what_a_block_uses(patch):
+    """A waiter is granted what a block still uses."""
+    recall = KeptGrants.recall
+
+    def wrong(self, tenure, *, now_ns):
+        recall(self, tenure, now_ns=now_ns)
+        if tenure.recalled and not tenure.committing:
+            self._end(tenure)
+
+    patch(KeptGrants, "recall", wrong)
+
+
 ALL = (
+    any_seq_under_a_kept_grant,
+    keeps_though_another_waits,
+    repeated_answer_says_that_it_is_over,
+    nothing_is_revoked,
+    cell_is_not_cleared,
+    revokes_what_a_block_uses,
     retains_one_version_more,
     shows_another_stamp,
     lease_ends_a_nanosecond_late,

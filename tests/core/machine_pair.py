@@ -10,6 +10,7 @@ from collections import Counter
 from itertools import count
 from typing import TYPE_CHECKING
 
+from kept_parts import FakeMarks
 from machine_answers import fact_of, plain
 from reference_commits import ReferenceShard
 from reference_parts import DURABILITY, RETENTION
@@ -56,7 +57,8 @@ class Pair:
             entry = AspectEntry(name, "int", durability, RETENTION[name])
             bench.register(entry)
         self._base, self._settings = bench, bench.settings
-        self.shard = bench.shard
+        self.shard, self.marks = bench.shard, FakeMarks()
+        self.shard.state.tenures.kept.marks = self.marks
         self.now_ns, self.wall_ns = bench.now_ns, bench.wall_ns
         self.born_ns = self.now_ns
         self.reference = ReferenceShard(1, self.now_ns, None, 0)
@@ -110,6 +112,14 @@ class Pair:
         self._judge_answers(expected, effects)
         self._compare_state()
 
+    def mark(self, lock: LockId, *, on: bool) -> None:
+        """Take, or give back, the mark of a lock's grant."""
+        token = self.tokens.get(lock)
+        if token is not None and token.epoch == self.shard.epoch:
+            self._tell(f"{'used' if on else 'unused'}: {lock} {token}")
+            for marks in (self.marks.in_use, self.reference.used):
+                (marks.add if on else marks.discard)((lock.session, token.number))
+
     def report(self, number: int = 1) -> None:
         """Let the disk finish its oldest writes."""
         for persist in self.kept[self.reported : self.reported + number]:
@@ -131,6 +141,7 @@ class Pair:
         self.shard = type(self.shard)(
             self._settings, recovered, now_ns=self.now_ns, wall_ns=self.wall_ns
         )
+        self.marks = self.shard.state.tenures.kept.marks = FakeMarks()
         self.reference = ReferenceShard(epoch, self.now_ns, self.reference, keep)
         for slot in SLOTS:
             content = self.shard.state.slots[slot]
@@ -262,12 +273,12 @@ class Pair:
                 if fact[0] in ("outcome", "prepared"):
                     seen_ns = max(self.floor_ns, message.seen_stamp_ns)
                     self.same("a stamp comes after what was seen", stamp_ns > seen_ns, True)
-                    self.reference.lives[fact[1]].stamp_ns = stamp_ns
+                    self.reference.user(fact[1]).stamp_ns = stamp_ns
                     if fact[0] == "prepared":
                         self.reference.prepared_as[fact[1]].stamp_ns = stamp_ns
                 elif fact[0] == "slot" and isinstance(message, Commit):
                     # The first commit of a volatile slot leaves no outcome behind.
-                    self.reference.lives[message.lock].stamp_ns = stamp_ns
+                    self.reference.user(message.lock).stamp_ns = stamp_ns
 
     def _judge_changes(self, effects, expected) -> None:
         changes = [c for e in effects if isinstance(e, Publish) for c in e.notice.changes]
@@ -290,15 +301,24 @@ class Pair:
         tenures = state.tenures.by_lock
         self.same("locks", set(tenures), set(reference.lives))
         phases = {
-            lock: (t.claim.granted, t.bound, t.token, t.prepared is not None)
+            lock: (
+                (t.claim.granted, t.bound, t.token, t.prepared is not None),
+                (bool(t.kept), t.recalled),
+            )
             for lock, t in tenures.items()
         }
         promised = ("prepared", "finishing", "aborting")
         wanted = {
-            lock: (life.held, life.bound, life.token, life.phase in promised)
+            lock: (
+                (life.held, life.bound, life.token, life.phase in promised),
+                (life.kept, life.recalled),
+            )
             for lock, life in reference.lives.items()
         }
-        self.same("phases (held, bound, token, prepared)", phases, wanted)
+        self.same("phases (held, bound, token, prepared), (kept, recalled)", phases, wanted)
+        cells = {number for page in self.marks.cells.values() for number in page}
+        numbers = {i.token.number for i in reference.lives.values() if i.kept and not i.recalled}
+        self.same("cells", cells, numbers)
         waiting = sorted(
             (t.claim.ticket, lock) for lock, t in tenures.items() if not t.claim.granted
         )

@@ -12,6 +12,20 @@ from typing import ClassVar
 
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+from machine_cells import (
+    ABOUT_NO_LOCK,
+    BY_GRANT,
+    BY_HOST,
+    BY_LOCK,
+    BY_SESSION,
+    BY_TIME,
+    EVENTS,
+    LIVE,
+    OVER,
+    PAST,
+    STATES,
+    UNREACHABLE,
+)
 from machine_coverage import Coverage
 from machine_messages import HOLDS, MS, TTLS, Pick, Plans
 from machine_pair import Pair
@@ -22,63 +36,6 @@ from enact_dist.core.protocol.messages import AwaitStamp, Finish, ListLocks, Sur
 from enact_dist.core.protocol.records import Called, Drain, SessionSeen, Tick
 from enact_dist.core.state.clock import wrong_decision
 
-STATES = (
-    "unseen",
-    "waiting",
-    "parked",
-    "untold",
-    "granted",
-    "committing",
-    "deciding",
-    "preparing",
-    "prepared",
-    "finishing",
-    "aborting",
-    "decided",
-    "committed",
-    "forgotten",
-    "finished",
-    "forced",
-    "alarm",
-    "aborted",
-    "taken",
-    "given back",
-    "validated",
-    "dropped",
-    "lost",
-)
-LIVE = STATES[1:11]
-PAST = (STATES[0], STATES[0], *STATES[11:], "committed", "validated")
-AT_DISK = ("committing", "deciding", "preparing", "finishing", "aborting", "alarm")
-ABOUT_NO_LOCK = ("welcome", "told")
-"""What the disk works on without any lock waiting for it."""
-HELD = STATES[3:11]
-BY_LOCK = (
-    "acquire",
-    "commit",
-    "decide",
-    "expect",
-    "overreach",
-    "forge",
-    "outcome",
-    "validate",
-    "prepare",
-    "finish",
-    "told committed",
-    "told aborted",
-    "told open",
-    "peer finished",
-    "resolve",
-    "release",
-    "fetch",
-    "view",
-    "broken",
-    "force abort",
-)
-BY_SESSION = ("hello", "keep alive", "unwanted", "newer", "goodbye", "token seen", "token gone")
-BY_TIME = ("tick", "lease end", "hold end", "slice end", "stall")
-BY_HOST = ("persisted", "kill", "power cut", "drain")
-EVENTS = BY_LOCK + BY_SESSION + BY_TIME + BY_HOST
 PICK = st.integers(0, (1 << 62) - 1)
 PICKS = st.lists(PICK, min_size=2, max_size=5)
 
@@ -93,27 +50,16 @@ REMEMBERED = 2
 """So many of a lane's newest locks are counted and spoken to."""
 
 
-def _unreachable() -> dict[tuple[str, str], str]:
-    cells = {}
-    for state in STATES:
-        if state not in AT_DISK:
-            cells[state, "persisted"] = "nothing of it is at the disk"
-        if state not in HELD:
-            cells[state, "hold end"] = "no hold limit runs before the grant or after the end"
-        if state != "parked":
-            cells[state, "slice end"] = "no request of it is parked"
-    for state in ("finishing", "finished", "alarm"):
-        cells[state, "told aborted"] = "its primary has committed, and decides once"
-    return cells
-
-
-UNREACHABLE = _unreachable()
+def _owed(pick: int) -> tuple[str, str]:
+    return Pick(pick).one(ShardMachine.owed)
 
 
 class ShardMachine(Staging, RuleBasedStateMachine):
     """One shard under everything that its clients, its host and other shards can do to it."""
 
     coverage: ClassVar[Coverage]
+    owed: ClassVar[list[tuple[str, str]]] = []
+    """The cells that the rounds before have met too seldom."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -166,15 +112,27 @@ class ShardMachine(Staging, RuleBasedStateMachine):
         """Others speak about a lock that ended, or was not asked for yet."""
         self._meet(state, events)
 
-    @rule(state=st.sampled_from(LIVE + STATES[11:]), events=some_of(BY_SESSION))
+    @rule(state=st.sampled_from((*LIVE, *PAST, "kept", "recalled")), events=some_of(BY_GRANT))
+    def go_on(self, state, events):
+        """Blocks begin and end under grants that stay, or do not."""
+        self._meet(state, events)
+
+    @rule(state=st.sampled_from(LIVE + OVER), events=some_of(BY_SESSION))
     def come_and_go(self, state, events):
         """Sessions come, go and are heard of or not, with a lock in some state."""
         self._meet(state, events)
 
-    @rule(state=st.sampled_from(LIVE + STATES[11:]), events=some_of((*BY_TIME, *BY_HOST)))
+    @rule(state=st.sampled_from(LIVE + OVER), events=some_of((*BY_TIME, *BY_HOST)))
     def disturb(self, state, events):
         """Time and the host do something to a lock in some state."""
         self._meet(state, events)
+
+    @precondition(lambda self: self.owed)
+    @rule(cells=st.lists(PICK.map(lambda pick: (_owed(pick), pick)), min_size=3, max_size=6))
+    def make_up(self, cells):
+        """What was met too seldom so far is met."""
+        for (state, event), pick in cells:
+            self._meet(state, [(event, pick)])
 
     @rule(picks=PICKS)
     def work(self, picks):
@@ -220,7 +178,7 @@ class ShardMachine(Staging, RuleBasedStateMachine):
         for pick in picks:
             choice = Pick(pick)
             live = list(self.reference.lives)
-            event = choice.one(BY_LOCK[:9])
+            event = choice.one((*BY_LOCK[:9], *BY_GRANT[:3]))
             if live:
                 lock = choice.one(live)
                 self.late.append((event, lock, self._compose(event, lock, choice)))
@@ -297,8 +255,14 @@ class ShardMachine(Staging, RuleBasedStateMachine):
             self._event("acquire", lock, choice)
         elif state == "granted":
             alone = self.plans.alone.get(lock)
-            ways = ("commit", "expect") if alone else ("prepare", "prepare", "decide", "validate")
+            ways = (
+                ("keep", "keep", "commit", "expect")
+                if alone
+                else ("prepare", "prepare", "decide", "validate")
+            )
             self._event(choice.one(ways), lock, choice)
+        elif state in ("kept", "recalled"):
+            self._event(choice.one(("use", "use", "look", "used", "unused")), lock, choice)
         elif state == "prepared" and choice.below(2):
             self._event(choice.one(("finish", "told aborted", "force abort")), lock, choice)
 
@@ -318,6 +282,9 @@ class ShardMachine(Staging, RuleBasedStateMachine):
         elif event in ("token seen", "token gone"):
             self._hit_all(event, session=lock.session)
             self.pair.give(SessionSeen(lock.session, event == "token seen"))
+        elif event in ("used", "unused"):
+            self.coverage.hit(self.reference.state_of(lock), event)
+            self.pair.mark(lock, on=event == "used")
         elif event == "newer":
             self._event("acquire", self._next(lock[:2]), choice)
         elif self._possible(event, lock):
@@ -338,6 +305,9 @@ class ShardMachine(Staging, RuleBasedStateMachine):
         return True
 
     def _compose(self, event: str, lock: LockId, choice: Pick) -> object:
+        if event in ("use", "look"):
+            lane = (lock.session, choice.below(LANES))
+            return getattr(self.plans, event)(lock, self._next(lane), choice)
         return getattr(self.plans, event.replace(" ", "_"))(lock, choice)
 
     def _deliver(self, event: str, lock: LockId, message: object, how: str) -> None:
@@ -354,6 +324,9 @@ class ShardMachine(Staging, RuleBasedStateMachine):
             if event == "acquire" and lock.seq > self.tops[lock[:2]]:
                 self._hit_all("newer", lane=lock[:2])
                 self.tops[lock[:2]] = lock.seq
+            elif event in ("use", "look"):
+                later = message.lock
+                self.tops[later[:2]] = max(self.tops[later[:2]], later.seq)
         self.pair.give(message)
 
     def _consistent(self, event: str, lock: LockId, message: object) -> bool:
@@ -469,9 +442,10 @@ class ShardMachine(Staging, RuleBasedStateMachine):
             self.pair.report()
 
     def _report_of(self, lock: LockId) -> None:
-        while any(
-            lock in (work[1], getattr(work[1], "lock", None)) for work in self.reference.works
-        ):
+        def about(what) -> tuple:
+            return what, getattr(what, "lock", None), getattr(what, "user", None)
+
+        while any(lock in about(work[1]) for work in self.reference.works):
             self._report(1)
 
     def _crash(self, choice: Pick, event: str) -> None:

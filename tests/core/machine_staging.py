@@ -13,12 +13,26 @@ from machine_messages import MS, Pick
 from machine_pair import SLOTS
 from reference_table import conflict, lines_of
 
-from enact_dist.core.protocol.datum import LockId
+from enact_dist.core.protocol.datum import LockId, Slot
 from enact_dist.core.protocol.messages import Item
 from enact_dist.terms import Access
 
 LONG_NS = 60_000 * MS
 """A hold limit that does not end by itself while other things are tried."""
+
+
+ROWS_TRIED = 8
+"""Blocks in a row after which a grant that others took back too often is given up."""
+
+
+def write(slot) -> Item:
+    """Return the request that writes a slot."""
+    return Item(Access.WRITE, *slot)
+
+
+def _needed(rows, session: str, item: Item) -> int:
+    row = rows.get((session, (Slot(item.context, item.entity, item.aspect),)))
+    return row.needed - row.blocks if row is not None else 2
 
 
 class Staging:
@@ -57,6 +71,14 @@ class Staging:
             self._report(len(self.pair.kept))
         return lane
 
+    def _another(self, lock: LockId, choice: Pick) -> tuple[str, int]:
+        """Choose another thread than that of a lock, of a session that may ask."""
+        lane = choice.one([lane for lane in self.tops if lane != lock[:2]])
+        if self.reference.known(lane[0]) is None:
+            self._greet(lane[0])
+            self._report(len(self.pair.kept))
+        return lane
+
     def _ask(self, lane, items, *, wait_ns: int, alone: bool, choice: Pick) -> LockId:
         lock = self._next(lane)
         self.plans.items[lock], self.plans.alone[lock] = tuple(items), alone
@@ -75,7 +97,7 @@ class Staging:
         wanted = [line for life in self.reference.lives.values() for line in life.lines]
         free = []
         for slot in SLOTS:
-            item = Item(Access.WRITE, *slot)
+            item = write(slot)
             if not conflict(lines_of([item]), frozenset(wanted)):
                 free.append(item)
         if kept:
@@ -85,6 +107,45 @@ class Staging:
             return None
         lane = self._lane(choice)
         return self._ask(lane, [choice.one(free)], wait_ns=0, alone=alone, choice=choice)
+
+    def _kept(self, choice: Pick) -> LockId | None:
+        """Lock the same data in a row until the grant stays."""
+        lane = self._lane(choice)
+        wanted = frozenset(line for life in self.reference.lives.values() for line in life.lines)
+        free = [item for slot in SLOTS if not conflict(lines_of([item := write(slot)]), wanted)]
+        if not free:
+            self._make_room()
+            return None
+        rows = self.reference.rows
+        first = choice.below(len(free))
+        items = [min(free[first:] + free[:first], key=lambda i: _needed(rows, lane[0], i))]
+        for _ in range(ROWS_TRIED):
+            lock = self._ask(lane, items, wait_ns=0, alone=True, choice=choice)
+            if self.reference.state_of(lock) != "granted":
+                return None
+            waiter = None
+            if choice.below(6) == 0:
+                lane_of_it = self._another(lock, choice)
+                waiter = self._ask(lane_of_it, items, wait_ns=0, alone=True, choice=choice)
+            self._event("keep", lock, choice)
+            self._report_of(lock)
+            if waiter is not None:
+                self._event("release", waiter, choice)
+            if self.reference.state_of(lock) == "kept":
+                return lock
+        return None
+
+    def _recalled(self, choice: Pick) -> LockId | None:
+        """A block uses a grant that another lock waits for."""
+        kept = self.bring("kept", choice)
+        if kept is None:
+            return None
+        self._event("used", kept, choice)
+        lane = self._another(kept, choice)
+        if self.reference.state_of(kept) == "kept":
+            items = self.plans.items[kept]
+            self._ask(lane, items, wait_ns=1000 * MS, alone=False, choice=choice)
+        return kept
 
     def _make_room(self) -> None:
         """Whoever may gives back what it holds; the disk and the far primary do their part."""
@@ -106,11 +167,7 @@ class Staging:
         if not held:
             return None
         before = choice.one(held)
-        lanes = [lane for lane in self.tops if lane != before.lock[:2]]
-        lane = choice.one(lanes)
-        if self.reference.known(lane[0]) is None:
-            self._greet(lane[0])
-            self._report(len(self.pair.kept))
+        lane = self._another(before.lock, choice)
         if before.lock not in self.reference.lives:
             return None
         line = min(before.lines)
@@ -123,10 +180,7 @@ class Staging:
         before = self._granted(choice)
         if before not in self.reference.lives:
             return None
-        lane = choice.one([lane for lane in self.tops if lane != before[:2]])
-        if self.reference.known(lane[0]) is None:
-            self._greet(lane[0])
-            self._report(len(self.pair.kept))
+        lane = self._another(before, choice)
         items = self.plans.items[before]
         lock = self._ask(lane, items, wait_ns=0, alone=False, choice=choice)
         self._event("release", before, choice)
@@ -174,6 +228,8 @@ class Staging:
         "parked": lambda m, c: m._parked(c),
         "untold": lambda m, c: m._untold(c),
         "granted": lambda m, c: m._granted(c),
+        "kept": lambda m, c: m._kept(c),
+        "recalled": lambda m, c: m._recalled(c),
         "committing": lambda m, c: m._at_disk("commit", c),
         "deciding": lambda m, c: m._at_disk("decide", c),
         "preparing": lambda m, c: m._at_disk("prepare", c),

@@ -6,10 +6,10 @@ from copy import copy
 from typing import TYPE_CHECKING
 
 from reference_parts import DURABILITY, RETENTION, Decision, Lane, Life
-from reference_shard import EACH, MS, ReferenceSessions
+from reference_shard import MS
+from reference_views import ReferenceViews
 
 from enact_dist.core.protocol.messages import Finish, Resolve
-from enact_dist.patterns import pattern_matches
 
 if TYPE_CHECKING:
     from enact_dist.core.protocol.datum import LockId
@@ -20,17 +20,6 @@ STRICTER = ("volatile", "os", "durable")
 
 
 FORCED_ASK_NS = 2_000 * MS
-VIEW_WAIT_NS = 400 * MS
-NEVER_NS = 1 << 62
-
-
-def covers(item, slot) -> bool:
-    """Say whether an item names a slot."""
-    if (item.context, item.aspect) != (slot.context, slot.aspect):
-        return False
-    if item.access in EACH:
-        return pattern_matches(item.entity, slot.entity)
-    return item.entity == slot.entity
 
 
 def text_of(datum: object) -> str | None:
@@ -38,7 +27,7 @@ def text_of(datum: object) -> str | None:
     return None if datum is None else bytes(datum.body).decode()
 
 
-class ReferenceShard(ReferenceSessions):
+class ReferenceShard(ReferenceViews):
     """Everything that a shard decides."""
 
     # ---------------------------------------------------------------- restart
@@ -76,7 +65,7 @@ class ReferenceShard(ReferenceSessions):
         """What was prepared is held again before anything else is granted."""
         for slot in self.replaced:
             self.forget(slot)
-        self.views: dict[int, tuple] = {}
+        self.views = {}
         self.alarms: dict[LockId, list[int]] = {}
         for life in self.lives.values():
             self.number += 1
@@ -97,12 +86,13 @@ class ReferenceShard(ReferenceSessions):
     def on_commit(self, m, handle):
         known = self.outcome_of(m.lock)
         if known is not None:
-            self.answer(handle, "committed", m.lock, known)
+            self.answer(handle, "committed", m.lock, known, self.lives_still(m.lock, m.token))
             return
-        life = self.lives.get(m.lock)
-        if life is not None and life.phase in ("committing", "deciding"):
-            life.replies.append(handle)
+        flying = self.user(m.lock)
+        if flying is not None and flying.phase in ("committing", "deciding"):
+            flying.replies.append(handle)
             return
+        life = self.lives.get(m.lock) or self.kept_under(m.lock.session, m.token)
         refusal = self.refusal(m, life)
         if refusal is not None:
             if refusal[0] == "refused" and not life.bound:
@@ -111,8 +101,11 @@ class ReferenceShard(ReferenceSessions):
             return
         moved = self.moved(m.expects, m.lock)
         if moved is not None:
-            self.changed(life, handle, moved)
+            self.changed(m.lock, life, handle, moved)
             return
+        if life.kept:
+            self.lane_for(m.lock).top = m.lock.seq
+        life.user, life.asks_to_keep = m.lock, m.keep
         life.writes = tuple((write.slot, text_of(write.datum)) for write in m.writes)
         life.versions, life.participants = self.next_versions(life.writes), m.participants
         life.replies = [handle]
@@ -172,14 +165,18 @@ class ReferenceShard(ReferenceSessions):
     def committed(self, life: Life) -> None:
         """A commit stands: apply, free, answer, tell."""
         self.apply(life)
-        lane = self.lane_of(life.lock)
-        if lane.outcome is None or lane.outcome[0].seq < life.lock.seq:
-            lane.outcome = (life.lock, life.versions)
-        self.end(life, "forgotten")
+        lock, lane = life.user, self.lane_of(life.user)
+        if lane.outcome is None or lane.outcome[0].seq < lock.seq:
+            lane.outcome = (lock, life.versions)
+        life.phase = "granted"
+        stays = self.stays(life)
+        if not stays:
+            self.end(life, "forgotten")
+        self.ended[lock] = "forgotten"
         for handle in life.replies:
-            self.answer(handle, "committed", life.lock, life.versions)
+            self.answer(handle, "committed", lock, life.versions, stays)
         if life.participants:
-            self.decisions[life.lock] = Decision(list(life.participants), self.now_ns)
+            self.decisions[lock] = Decision(list(life.participants), self.now_ns)
             self.tell()
 
     def outcome_of(self, lock):
@@ -194,15 +191,17 @@ class ReferenceShard(ReferenceSessions):
             return "epoch", self.epoch
         if life is None or life.token != m.token:
             return self.fenced(m.lock)
+        if self.behind(life, m.lock):
+            return "fenced", m.lock
         slots = [write.slot for write in m.writes]
         allowed = all(any(line.allows(slot) for line in life.lines) for slot in slots)
         if life.bound or not allowed or len(set(slots)) < len(slots):
             return "refused", "protocol"
         return None
 
-    def changed(self, life, handle, moved):
+    def changed(self, lock, life, handle, moved):
         """End a lock whose expectation does not stand."""
-        answer = self.lane_of(life.lock).changed = ("changed", life.lock, *moved)
+        answer = self.lane_for(lock).changed = ("changed", lock, *moved)
         self.end(life, "given back")
         self.answer(handle, *answer)
 
@@ -227,7 +226,7 @@ class ReferenceShard(ReferenceSessions):
 
     def on_outcome(self, m, handle):
         known, lane = self.outcome_of(m.lock), self.lane_of(m.lock)
-        life = self.lives.get(m.lock)
+        life = self.user(m.lock)
         gone = m.lock.session not in self.people and not self.lanes.get(m.lock.session)
         at_disk = ("committing", "deciding", "preparing", "finishing", "aborting")
         newer = lane and max(lane.top, lane.outcome[0].seq if lane.outcome else 0) > m.lock.seq
@@ -240,25 +239,34 @@ class ReferenceShard(ReferenceSessions):
             self.answer(handle, "outcome", m.lock, kind, ())
 
     def on_validate(self, m, handle):
-        life, lane = self.lives.get(m.lock), self.lane_of(m.lock)
+        lane = self.lane_of(m.lock)
+        life = self.lives.get(m.lock) or self.kept_under(m.lock.session, m.token)
         here = self.known(m.lock.session) is not None
         moved = self.moved(m.expects, m.lock)
         if here and m.token.number and lane and lane.validated == (m.lock, m.token):
-            self.answer(handle, "valid", m.lock)
+            self.answer(handle, "valid", m.lock, self.lives_still(m.lock, m.token))
         elif m.token.epoch != self.epoch or not here:
             self.answer(handle, "epoch", self.epoch)
         elif not m.token.number:
-            self.answer(handle, *(("changed", m.lock, *moved) if moved else ("valid", m.lock)))
+            found = ("changed", m.lock, *moved) if moved else ("valid", m.lock, False)
+            self.answer(handle, *found)
         elif life is None or life.token != m.token:
             self.answer(handle, *self.fenced(m.lock))
-        elif life.bound:
+        elif life.bound or self.behind(life, m.lock):
             self.answer(handle, "fenced", m.lock)
         elif moved:
-            self.changed(life, handle, moved)
+            self.changed(m.lock, life, handle, moved)
         else:
+            lane = self.lane_for(m.lock)
             lane.validated = (m.lock, m.token)
-            self.end(life, "validated")
-            self.answer(handle, "valid", m.lock)
+            if life.kept:
+                lane.top = m.lock.seq
+            life.user, life.asks_to_keep = m.lock, m.keep
+            stays = self.stays(life)
+            if not stays:
+                self.end(life, "validated")
+            self.ended[m.lock] = "validated"
+            self.answer(handle, "valid", m.lock, stays)
 
     # ---------------------------------------------------------------- promises
 
@@ -274,7 +282,7 @@ class ReferenceShard(ReferenceSessions):
         if refusal is not None:
             self.answer(handle, *refusal)
         elif moved:
-            self.changed(life, handle, moved)
+            self.changed(m.lock, life, handle, moved)
         else:
             life.writes = tuple((write.slot, text_of(write.datum)) for write in m.writes)
             life.versions, life.phase = self.next_versions(life.writes), "preparing"
@@ -423,51 +431,6 @@ class ReferenceShard(ReferenceSessions):
         for handle in self.alarms.pop(lock):
             self.answer(handle, "finished", lock)
 
-    def on_takeview(self, m, handle):
-        person = self.known(m.lock.session, m.epoch)
-        if person is None:
-            self.answer(handle, "epoch", self.epoch)
-            return
-        self.renew(person, m.count)
-        if m.at_ns and self.undecided_ns(m.items) <= m.at_ns:
-            self.views[handle] = (m, self.now_ns + VIEW_WAIT_NS)
-        else:
-            self.view(m, handle)
-
-    def view(self, m, handle):
-        """Show the present; the past is judged by the machine, which knows the stamps."""
-        shown = None if m.at_ns else frozenset(self.shown(m.items))
-        self.answer(handle, "viewed", m.lock, shown)
-
-    def undecided_ns(self, items):
-        """Return the least stamp that an undecided commit on these items may get."""
-        stamps = [
-            life.stamp_ns
-            for life in self.lives.values()
-            if life.bound and any(covers(item, slot) for item in items for slot, _ in life.writes)
-        ]
-        return min(stamps, default=NEVER_NS)
-
-    def answer_views(self):
-        """A view waits for the undecided before it, but not for ever; its session may end."""
-        for handle, (m, end_ns) in list(self.views.items()):
-            enough = end_ns <= self.now_ns or self.draining
-            if enough or self.undecided_ns(m.items) > m.at_ns:
-                del self.views[handle]
-                if self.known(m.lock.session) is None:
-                    self.answer(handle, "epoch", self.epoch)
-                else:
-                    self.view(m, handle)
-
-    def on_fetch(self, m, handle):
-        version, text = self.slots.get(m.slot, (0, None))
-        if self.known(m.lock.session, m.epoch) is None:
-            self.answer(handle, "epoch", self.epoch)
-        elif text is not None and version == m.version:
-            self.answer(handle, "slice", m.slot, version, text)
-        else:
-            self.answer(handle, "gone", m.slot, m.version)
-
     def deadlines_ns(self):
         """Return the times at which something is due."""
         due = super().deadlines_ns()
@@ -483,6 +446,8 @@ class ReferenceShard(ReferenceSessions):
         """Return a lock's row in the table of cells."""
         if lock in self.lives:
             return self.lives[lock].state
+        if (life := self.user(lock)) is not None and life.bound:
+            return life.state
         if lock in self.forced:
             return "alarm" if lock in self.alarms else "forced"
         if lock in self.decisions:

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 from reference_table import lines_of
 
+from enact_dist.terms import Access
+
 if TYPE_CHECKING:
     from enact_dist.core.protocol.datum import LockId, Position, Slot, Token
     from enact_dist.core.protocol.messages import Acquire, Item
@@ -19,6 +21,9 @@ RETENTION = {"count": 1, "note": 3, "frame": 2}
 
 CAPTURED_NS = (0, 100, 200, 300)
 """Capture stamps of data: each value says by itself which is its own."""
+
+NAMED = (Access.READ, Access.WRITE)
+"""What may be asked for where a grant is to stay."""
 
 BOUND = ("committing", "deciding", "preparing", "prepared", "finishing", "aborting")
 """Phases that neither a client nor time can end."""
@@ -63,8 +68,20 @@ class Lane:
 
 
 @dataclass
+class Row:
+    """Blocks of the same data in a row, and how many there must be until a grant stays."""
+
+    blocks: int = 0
+    needed: int = 2
+    uses: int = 0
+
+
+@dataclass
 class Life:
-    """One lock from its arrival to its end."""
+    """One lock from its arrival to its end; of a grant that stays, to the end of that.
+
+    `user` is the lock that commits under it: itself, or a later one of its session.
+    """
 
     lock: LockId
     number: int
@@ -86,11 +103,19 @@ class Life:
     ask_ns: int = 0
     stamp_ns: int = 0
     replies: list[int] = field(default_factory=list)
+    user: LockId | None = None
+    keepable: bool = False
+    asks_to_keep: bool = False
+    kept: bool = False
+    recalled: bool = False
 
     @staticmethod
     def of(message: Acquire, number: int) -> Life:
         """Return the life that a request begins."""
-        return Life(message.lock, number, message.items, message.alone, message.hold_ns)
+        life = Life(message.lock, number, message.items, message.alone, message.hold_ns)
+        named = all(i.access in NAMED and not i.captured_ns for i in message.items)
+        life.keepable, life.user = message.alone and named, message.lock
+        return life
 
     @property
     def bound(self) -> bool:
@@ -112,6 +137,8 @@ class Life:
         """Its row in the table of cells."""
         if self.phase == "waiting":
             return "waiting" if self.parked is None else "parked"
+        if self.phase == "granted" and self.kept:
+            return "recalled" if self.recalled else "kept"
         if self.phase == "granted" and not self.told:
             return "untold"
         return self.phase

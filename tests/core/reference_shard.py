@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from reference_kept import LOOK_AGAIN_NS, ReferenceKeeping
 from reference_parts import RETENTION, Decision, Expected, Lane, Life, Person, captured_of
 from reference_table import ReferenceTable
 
@@ -28,7 +29,7 @@ TELLS = ("commit", "prepare", "finish", "abort")
 """What is persisted with a word about history that has gone."""
 
 
-class ReferenceSessions:
+class ReferenceSessions(ReferenceKeeping):
     """Who is alive, what waits, what is held; no data yet.
 
     Args:
@@ -52,6 +53,7 @@ class ReferenceSessions:
         self.tokens_elsewhere: set[str] = set()
         self.by_hand: dict[str, object] = {}
         self.number = 0
+        self.rows, self.used = {}, set()
         self.draining = False
         self.disk: list[tuple] = before.disk[:keep] if before else []
         self.ended: dict[LockId, str] = dict(before.ended) if before else {}
@@ -209,7 +211,7 @@ class ReferenceSessions:
         self.renew(person, m.count)
         lowest = {view.lane: view.seq for view in m.view}
         for life in self.of(m.session):
-            if life.lock.seq < lowest.get(life.lock.lane, 0) and not life.bound:
+            if life.lock.seq < lowest.get(life.lock.lane, 0) and not (life.bound or life.kept):
                 self.end(life, "given back")
         left = {
             (life.lock, max(0, life.hold_end_ns - self.now_ns))
@@ -234,6 +236,7 @@ class ReferenceSessions:
         for life in self.of(session):
             if not life.bound:
                 self.end(life, "taken")
+        self.session_over(session)
         person = self.people.pop(session)
         if person.token:
             self.tokens_elsewhere.add(session)
@@ -276,7 +279,7 @@ class ReferenceSessions:
                 self.answer(handle, "stale", m.lock)
                 return
             for older in self.of(m.lock.session):
-                if older.lock.lane == m.lock.lane and not older.bound:
+                if older.lock.lane == m.lock.lane and not (older.bound or older.kept):
                     self.end(older, "taken")
             lane.top = m.lock.seq
             self.number += 1
@@ -284,6 +287,10 @@ class ReferenceSessions:
             self.ended.pop(m.lock, None)
             self.table.enqueue(m.lock, life.lines)
             self.grant()
+            if not life.held:
+                for holder in self.table.in_the_way(m.lock)[0]:
+                    self.take_back(self.lives[holder])
+                self.grant()
         if life.held:
             self.answer(handle, *self.granted(life))
             return
@@ -379,6 +386,11 @@ class ReferenceSessions:
             self.end(life, "given back")
         elif life is not None and life.phase in ("prepared", "finishing", "aborting"):
             life.ask_ns = min(life.ask_ns, self.now_ns + 50 * MS)
+        elif life is None and any(other.kept for other in self.of(m.lock.session)):
+            lane = self.lane_of(m.lock)
+            if lane is not None and lane.top < m.lock.seq:
+                lane.top = m.lock.seq
+                self.ended[m.lock] = "given back"
         self.answer(handle, "released")
 
     # ---------------------------------------------------------------- time
@@ -392,8 +404,10 @@ class ReferenceSessions:
                         self.drop(life)
                     elif not life.bound:
                         self.end(life, "taken")
+        self.end_unused()
         for life in list(self.lives.values()):
-            if life.phase == "granted" and life.hold_end_ns <= self.now_ns:
+            over = life.phase == "granted" and life.hold_end_ns <= self.now_ns
+            if over and (life.recalled or not life.kept):
                 self.end(life, "taken")
         for session, person in sorted(self.people.items(), key=self._silent_for_longest):
             away_ns = self.now_ns - person.lease_end_ns(self.now_ns)
@@ -417,11 +431,13 @@ class ReferenceSessions:
 
     def on_drain(self, _, __):
         self.draining = True
+        for life in list(self.lives.values()):
+            self.take_back(life)
         for life in self.lives.values():
             self.unpark(life)
 
     def on_listlocks(self, _, handle):
-        found = [(life.number, life.lock, life.held) for life in self.lives.values()]
+        found = [(i.number, i.lock, i.held, self.use_of(i)) for i in self.lives.values()]
         self.answer(handle, "locks", tuple(sorted(found)))
 
     def on_awaitstamp(self, _, __):
@@ -434,7 +450,9 @@ class ReferenceSessions:
             person = self.people.get(life.lock.session)
             if person is not None and not life.bound:
                 due.append(person.lease_end_ns(self.now_ns))
-            if life.phase == "granted":
+            if life.recalled:
+                due.append(self.now_ns + LOOK_AGAIN_NS)
+            if life.phase == "granted" and (life.recalled or not life.kept):
                 due.append(life.hold_end_ns)
             if life.parked is not None:
                 due.append(life.slice_end_ns)

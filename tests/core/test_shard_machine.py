@@ -11,8 +11,9 @@ import machine_mutants
 import pytest
 from hypothesis import Phase, Verbosity
 from hypothesis.stateful import run_state_machine_as_test
+from machine_cells import EVENTS, STATES, UNREACHABLE
 from machine_coverage import Coverage, examples, run_and_cover, settings_of
-from machine_shard import EVENTS, STATES, UNREACHABLE, ShardMachine
+from machine_shard import ShardMachine
 
 from enact_dist.core.shard.shard import Shard
 
@@ -33,6 +34,7 @@ COUNTED = (
 def test_shard_agrees_with_the_definition_step_by_step():
     """Answers, locks, versions, outcomes, leases and records; every reachable cell is met."""
     coverage = ShardMachine.coverage = Coverage(STATES, EVENTS, UNREACHABLE)
+    ShardMachine.owed = []
 
     problems = run_and_cover(ShardMachine, examples(EXAMPLES), coverage)
 
@@ -46,6 +48,7 @@ def test_shard_agrees_with_the_definition_step_by_step():
 def test_machine_bites(mutant, monkeypatch):
     """With the shard's own assertions off, a small wrong edit is noticed within some examples."""
     coverage = ShardMachine.coverage = Coverage(STATES, EVENTS, UNREACHABLE)
+    ShardMachine.owed = []
     monkeypatch.setattr(Shard, "assert_invariants", lambda _shard: None)
     mutant(monkeypatch.setattr)
     quick = settings_of(

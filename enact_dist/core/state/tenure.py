@@ -291,7 +291,8 @@ class KeptGrants:
         mine = self._of.get(session, {})
         if len(mine) >= KEPT_OF_SESSION_MAX:
             for number, tenure in mine.items():
-                if not tenure.committing and not self.marks.used(session, number):
+                busy = tenure.committing or tenure.recalled
+                if not busy and not self.marks.used(session, number):
                     self.recall(tenure, now_ns=now_ns)
                     break
         return len(mine) < KEPT_OF_SESSION_MAX and len(self.by_number) < KEPT_MAX
@@ -338,7 +339,7 @@ class KeptGrants:
                 self._end(tenure)
 
     def in_use(self) -> list[Tenure]:
-        """Return the recalled grants whose block time may end."""
+        """Return the recalled grants whose hold limit may end them."""
         return [tenure for tenure in self.recalled.values() if not tenure.committing]
 
     def over(self, tenure: Tenure) -> None:
