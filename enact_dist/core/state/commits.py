@@ -258,10 +258,7 @@ class Commits:
 
     def _make_durable(self, commit: _InFlight, *, now_ns: int) -> Iterable[Effect]:
         """Hand the commit to the store, or apply it at once where nothing is to survive."""
-        outcome = commit.outcome
-        # A decision is relied on by other shards, so it outlasts everything.
-        decided = commit.decision is not None
-        durability = Durability.DURABLE if decided else self._catalogue.strictest(commit.writes)
+        durability, outcome = self._strictest(commit), commit.outcome
         if durability is Durability.VOLATILE and not commit.new:
             return self._apply(commit, now_ns=now_ns)
         stamp_ns = outcome.position.stamp_ns
@@ -278,6 +275,11 @@ class Commits:
         return self._persist(
             (*kept, *decision, *forgotten), durability, partial(self._persisted, commit)
         )
+
+    def _strictest(self, commit: _InFlight) -> Durability:
+        """Return what a commit must survive; other shards rely on a decision, whatever its data."""
+        decides = commit.decision is not None
+        return Durability.DURABLE if decides else self._catalogue.strictest(commit.writes)
 
     def _persisted(self, commit: _InFlight, now_ns: int) -> Iterable[Effect]:
         """The store is done: apply, release and answer."""
