@@ -111,7 +111,8 @@ class ReferenceKeeping:
         """Return how a grant that stays is used, for people."""
         if not life.kept:
             return ""
-        return "recalled" if life.recalled else "used" if self.is_used(life) else "unused"
+        used = life.bound or self.is_used(life)
+        return "recalled" if life.recalled else "used" if used else "unused"
 
     def user(self, lock: LockId) -> Life | None:
         """Return the life under which a lock has a commit, a promise or a grant."""
