@@ -30,6 +30,8 @@ RULES = {
     9: "I9 never committed and aborted",
     10: "I10 prepared keeps its lock",
     12: "I12 nothing is left",
+    13: "I13 no waiter is bypassed",
+    16: "I16 nothing is executed twice",
     17: "I17 a commit in flight keeps its lock",
     18: "I18 no commit is seen half",
 }
@@ -233,7 +235,93 @@ def _expected_views() -> list[Variant]:
     ]
 
 
-VARIANTS = (*_commits(), *_grace(), *_cuts(), *_expected_views())
+def _kept_grants() -> list[Variant]:
+    model = "kept_grants"
+    living, restart, one = ("NO_DEATH",), ("EPOCHS=2",), ("ONE_SESSION",)
+    steady = ("STEADY", *living)
+    more, silent = ("LOCKS0=3", "LOCKS1=2", *steady), ("NO_RELEASES", "LOCKS1=2", *steady)
+    renumbered = (*one, *restart, "LOCKS1=2", *steady)
+    mutants = [
+        ("USES_WITHOUT_MARK", steady, 7, "a use begins by the cell alone"),
+        ("REVOKES_IN_USE", steady, 7, "the shard revokes without asking about the mark"),
+        ("MARK_BEFORE_CELL", steady, 7, "it asks about the mark, then clears the cell"),
+        ("NO_LOOK_BEFORE", steady, 13, "a use begins without a look at the cell"),
+        ("NO_SEQ_CHECK", steady, 2, "any seq commits under a kept grant"),
+        ("LATE_READS", steady, 7, "a late Validate ends a kept grant that is in use"),
+        ("KEEPS_AFTER_UNKNOWN", steady, 2, "the entry stays after a commit without an answer"),
+        ("SHOWS_OLD", steady, 2, "its own commit does not change the entry"),
+        ("KEEPS_WITH_WAITER", steady, 12, "a grant is kept though another lock waits"),
+        ("LEAVES_MARK", steady, 12, "a use without an answer does not give its mark back"),
+        ("NO_REPAIR", steady, 12, "a tick does not look after what was recalled"),
+        ("SETS_CELL_AGAIN", more, 7, "a commit after the recall sets the cell again"),
+        ("BREAKS_SILENTLY", living, 6, "a kept grant that is broken leaves its number in the cell"),
+        ("KEEP_ALIVE_ENDS_KEPT", steady, 7, "a keep-alive frees a grant whose first lock is over"),
+        ("SUPERSEDES_KEPT", (*one, *steady), 7, "so does a newer lock of the thread"),
+        ("IN_FLIGHT_ENDS", steady, 2, "a grant whose commit the store works on is revoked"),
+        ("KEEPS_OVER_EPOCH", (*restart, *steady), 6, "an epoch is acknowledged, the entry stays"),
+        ("DROPS_ENTRIES_ALONE", (*restart, *steady), 6, "an entry that was just taken stays"),
+        ("BELIEVES_FOREVER", (*restart, *living), 6, "a use begins though its lease is over"),
+        ("NUMBERS_START_AGAIN", renumbered, 7, "an epoch uses the old bytes again"),
+    ]
+    goals = [
+        (1, steady, "a recall between the mark and the look at the cell"),
+        (2, steady, "the look after a use finds that it was recalled"),
+        (3, steady, "a late commit under a kept grant that its client has forgotten"),
+        (4, steady, "a recall in use"),
+        (5, steady, "a recall while idle"),
+        (6, steady, "a tick ends what was recalled"),
+        (7, (*restart, *steady), "a restart beside a kept grant"),
+        (8, steady, "a session's own kept grant is in its way"),
+        (9, living, "a lease ends while the mark is held"),
+    ]
+    return [
+        Variant(model, "2 sessions, 2 locks each", HOLDS, ("LOCKS1=2", *living)),
+        Variant(model, "3 locks and 2; no lease ends", HOLDS, more),
+        Variant(model, "2 locks each; no lease ends, no Release comes", HOLDS, silent),
+        Variant(model, "2 locks and 1, deaths, 1 restart", HOLDS, restart),
+        Variant(model, "1 session, 2 threads, 2 locks and 1, 1 restart", HOLDS, (*one, *restart)),
+        *(
+            Variant(model, text, BREAKS, (macro, *size), rule)
+            for macro, size, rule, text in mutants
+        ),
+        *(
+            Variant(model, text, REACHES, (f"GOAL={goal}", *size), goal)
+            for goal, size, text in goals
+        ),
+    ]
+
+
+def _kept_order() -> list[Variant]:
+    model, three = "kept_order", ("THREADS=3", "LOCKS=2")
+    mutants = [
+        ("NEVER_REVOKES", "a kept grant ends with its next use only"),
+        ("OWN_NOT_REVOKED", "a kept grant does not end for a lock of the same session"),
+        ("TAKES_EARLY", "a lock over two shards takes what is kept at once, out of turn"),
+        ("NO_ORDER", "one client begins with the other shard"),
+    ]
+    goals = [
+        (1, "a lock begins from what is kept"),
+        (2, "a lock over two shards ends what its own session keeps"),
+        (3, "a lock over two shards is granted"),
+        (4, "a lock ends what another session keeps"),
+        (5, "what is kept ends with its use"),
+    ]
+    return [
+        Variant(model, "2 sessions, 2 shards, 4 locks each", HOLDS, ("LOCKS=4",)),
+        Variant(model, "the same, one of them with 2 threads, 2 locks each", HOLDS, three),
+        *(Variant(model, text, BREAKS, (macro,), 12) for macro, text in mutants),
+        *(Variant(model, text, REACHES, (f"GOAL={goal}",), goal) for goal, text in goals),
+    ]
+
+
+VARIANTS = (
+    *_commits(),
+    *_grace(),
+    *_cuts(),
+    *_expected_views(),
+    *_kept_grants(),
+    *_kept_order(),
+)
 MODELS = tuple(dict.fromkeys(variant.model for variant in VARIANTS))
 
 
