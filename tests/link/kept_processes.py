@@ -3,6 +3,7 @@
 import os
 import signal
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 from socket_parts import COUNT, CUP
 
@@ -108,3 +109,9 @@ class Waiting:
 
 def waiters(cell):
     return [info for info in cell.locks() if not info.granted]
+
+
+def in_thread(act, *arguments):
+    """Call in another thread, which may lock though this one does."""
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(act, *arguments).result()

@@ -2,7 +2,7 @@
  * shard, revoked without a message to the client.
  *
  * Each step names what it mirrors in enact_dist/core (file:function):
- *   state/kept_grants.py:keep, recall, over, find   kept, recalled, over; the tenure of a token
+ *   state/tenure.py:stays, recall, over, find   kept, recalled, over; the tenure of a token
  *   state/commits.py:commit, validate, _persisted, _apply   the end of a use at the shard
  *   shard/on_lock.py:on_acquire, _supersede, on_release   a lock that conflicts; one that is over
  *   shard/on_session.py:on_keep_alive, end, shard/shard.py:_on_tick, _expire, _on_break   other ends

@@ -3,7 +3,7 @@
  * Each step names what it mirrors in enact_dist/core (file:function):
  *   client/plan.py:first_asking, client/lock.py:_acquire, _advance   one shard after the other
  *   client/kept.py:take, put_back   a lock on one shard may begin from a kept grant
- *   state/kept_grants.py:keep, recall, over   kept, revoked, over with its use
+ *   state/tenure.py:stays, recall, over   kept, revoked, over with its use
  *   shard/on_lock.py:on_acquire, state/lock_table.py:enqueue, take_ready, remove   the queue
  *
  * A lock takes shard 0, or shard 1, or both in this order.  On one shard it may be kept afterwards,
