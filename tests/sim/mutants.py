@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import mutants_directed
 import mutants_growth as growth
 import mutants_history as history
+import mutants_keeping as keeping
 import mutants_one_shard as one
 import mutants_over_shards as over
 import mutants_payloads as payloads
@@ -44,6 +45,7 @@ SIMULATED = (
     *_of(worlds),
     *_of(history),
     *_of(growth),
+    *_of(keeping),
 )
 """Those that the simulator catches."""
 ALL = (*SIMULATED, *DIRECTED)

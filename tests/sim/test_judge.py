@@ -14,6 +14,7 @@ from enact_dist.terms import Durability
 from enact_dist.verify.simulation.faults import NONE
 from enact_dist.verify.simulation.hosts.world import S, SimulationError
 from enact_dist.verify.simulation.judges.growth import NEWER, NEWER_ENCODING, OLDER
+from enact_dist.verify.simulation.judges.history import conflict
 from enact_dist.verify.simulation.scenario import Scenario
 
 STRANGER = LockId("stranger", 0, 1)
@@ -111,7 +112,7 @@ def test_i13_grant_past_an_earlier_waiter_is_seen():
         waiting = [t for t in tenures.values() if t.token is None and t.lock in picture.arrivals]
         for holder in (t for t in tenures.values() if t.token is not None and not t.bound):
             for waiter in waiting:
-                if set(holder.items) & set(waiter.items) and holder.lock in picture.granted:
+                if conflict(holder.items, waiter.items) and holder.lock in picture.granted:
                     # As if the holder had come after the waiter, and been granted just now.
                     picture.arrivals[waiter.lock], picture.newest_token = 0, None
                     picture.granted_ever.pop(holder.lock)

@@ -158,6 +158,15 @@ HAPPENED = (
     "payloads adopted after a long time",
     "drafts given up for want of slices",
     "refused: no_payload",
+    # What stayed with a session between two locks.
+    "shard: grants_kept",
+    "shard: grants_revoked",
+    "shard: grants_recalled",
+    "locks begun without a call",
+    "locks ended without a call",
+    "late commits under a kept grant fenced",
+    "steps while a shard looks at marks",
+    "unknown commits that never came",
 )
 
 

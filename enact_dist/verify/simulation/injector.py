@@ -52,6 +52,7 @@ class Injector:
         self.clock_set: Callable[[], None] = lambda: None
         self._decisions = world.schedule.place("decision")
         self._told = world.schedule.place("told")
+        self._steps = world.schedule.place("step")
         network.set_off = self.set_off
         network.before_decision = self.before_decision
         for host in shards.values():
@@ -290,6 +291,30 @@ class Injector:
         bits = place.next()
         if (bits & 0xFFFF) < self._faults.triggered * 0x8000:
             self._crash_around(place.fault, Random(bits), [host], within_ns=6 * MS)
+
+    def at_step(self, client: ClientNode, shard: str) -> None:
+        """Let a client that is between two steps with a kept grant, or its shard, be struck."""
+        bits = self._steps.next()
+        fault = self._steps.fault
+        if (bits & 0xFFFF) >= self._faults.triggered * 0x8000 or self._over:
+            return
+        if not self._world.schedule.allows(fault):
+            return
+        luck, host = Random(bits), self._shards[shard]
+        kind, text = luck.choice(("pause", "kill", "crash", "stall", "starve")), ""
+        if kind == "pause":
+            text = self._pause(client, luck)
+        elif kind == "kill":
+            text = self._kill(client, luck)
+        elif kind == "stall":
+            text = self._stall(host, luck)
+        elif kind == "starve":
+            client.starves_until_ns = max(client.starves_until_ns, self._world.now_ns + 3 * S)
+            text = f"{client.name} sends no keep-alive for 3000 ms"
+        else:
+            self._crash_later(fault, host, luck, luck.choice((0, MS, 5 * MS)))
+        if text:
+            self._world.befell(fault, text)
 
     def before_decision(self, commit: Commit, primary: Host) -> None:
         """All are prepared, and the commit that decides is about to leave its client."""

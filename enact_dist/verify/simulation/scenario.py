@@ -13,7 +13,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from enact_dist.core.protocol.messages import PlacementMap, ShardEntry
-from enact_dist.core.protocol.records import SessionSeen
+from enact_dist.core.protocol.records import Drain, SessionSeen
 from enact_dist.core.shard.state import ShardSettings
 from enact_dist.verify.simulation import cells
 from enact_dist.verify.simulation import faults as fault_options
@@ -35,6 +35,7 @@ from enact_dist.verify.simulation.work.workload import ASPECTS, Workload
 if TYPE_CHECKING:
     from collections import Counter
 
+    from enact_dist.core.state.tenure import Tenure
     from enact_dist.verify.simulation.faults import Faults
 
 QUIET_NS = 30 * S
@@ -93,9 +94,11 @@ class Scenario:
         self.model = Model(world, self.history, ASPECTS)
         self.network = Network(world, cell.faults, through_wire=through_wire)
         self.shards = self._made_shards(cell.shards)
+        self.workload = Workload(world, self.history, self.model, entities=cell.entities)
         for host in self.shards.values():
             host.asserts = asserts
-        self.workload = Workload(world, self.history, self.model, entities=cell.entities)
+            host.keeps, host.between = self.workload.keepers.takes_place, self._between
+        self._steps = self.schedule.place("steps")
         self.forker = Forker(world, self.model, self.workload)
         self.historian = Historian(world, self.history, self.model, self.workload)
         self.injector = Injector(
@@ -132,7 +135,10 @@ class Scenario:
             check_beliefs=self.model.of_clients.check_beliefs,
             faults=self.cell.faults,
             ttl_ns=self.cell.ttl_ns,
+            sight=self.workload.keepers.sight(number),
         )
+        host.kept.looked = self.model.keeping.looked
+        host.kept.stands = partial(self.injector.at_step, host)
         host.generation = 0 if before is None else before.generation + 1
         self.injector.clients[number] = host
         self.model.of_clients.clients.append(host)
@@ -148,6 +154,13 @@ class Scenario:
                 host.start(self.historian.thread(host, self.cell.lanes + 1))
 
         host.start(host.open(self.workload.growth.registered(ASPECTS), work))
+
+    def _between(self, session: str) -> None:
+        """Let the threads of a client that stand between two steps go on, or some of them."""
+        for host in self.injector.clients.values():
+            if host.client.session == session:
+                while self._steps.next() & 3 and host.acts():
+                    pass
 
     # ---------------------------------------------------------------- the run
 
@@ -188,6 +201,7 @@ class Scenario:
             self.world.run_until(self.world.now_ns + POLL_NS)
         self._check_quiet()
         self._linger()
+        self._check_given_up()
         for host in self.shards.values():
             host.payloads.check_released()
             host.close()
@@ -217,9 +231,7 @@ class Scenario:
     def _quiet(self) -> bool:
         busy = any(host.threads_left for host in self.model.of_clients.clients if host.up)
         locks = any(
-            host.shard.state.tenures.by_lock
-            or host.unanswered
-            or host.shard.state.decisions.by_lock
+            _locks_left(host) or host.unanswered or host.shard.state.decisions.by_lock
             for host in self.shards.values()
         )
         return not busy and not locks
@@ -232,12 +244,20 @@ class Scenario:
                 facts = (client.name, client.threads_left, phases)
                 self.world.violation("I12 all threads end", *facts)
         for host in self.shards.values():
-            left = host.shard.state.tenures.by_lock
+            left = _locks_left(host)
             untold = host.shard.state.decisions.by_lock
             if left or host.unanswered or untold:
                 self.world.violation(
-                    "I12 nothing is left", host.name, list(left.values()), host.unanswered, untold
+                    "I12 nothing is left", host.name, left, host.unanswered, untold
                 )
+
+    def _check_given_up(self) -> None:
+        """I12: a shard that is told to stop takes all grants back at once that nobody uses."""
+        for host in self.shards.values():
+            host.event(Drain())
+            if host.shard.state.tenures.by_lock or not host.shard.idle:
+                left = list(host.shard.state.tenures.by_lock.values())
+                self.world.violation("I12 no kept grant keeps a shard", host.name, left)
 
     def _heal(self) -> None:
         self.world.tell("faults end")
@@ -274,3 +294,8 @@ class Scenario:
         seen = SessionSeen(host.client.session, present and self.cell.faults.tokens)
         for shard in self.shards.values():
             self.world.after(10 * MS, partial(shard.receive, partial(shard.event, seen)))
+
+
+def _locks_left(host: ShardNode) -> list[Tenure]:
+    """Return the locks of a shard without the kept grants that nobody uses."""
+    return [t for t in host.shard.state.tenures.by_lock.values() if not host.is_unused(t)]

@@ -13,6 +13,7 @@ from functools import partial
 from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 from enact_dist.core.client.client import Client
+from enact_dist.core.client.plan import Phase
 from enact_dist.core.protocol.messages import (
     Acquire,
     Answer,
@@ -23,8 +24,10 @@ from enact_dist.core.protocol.messages import (
     Register,
     Registered,
     Request,
+    Welcome,
 )
 from enact_dist.link.client.catalogue import CATALOGUES, KnownCatalogue
+from enact_dist.verify.simulation.hosts.keeping import KeptLocks, Sight, Stop
 from enact_dist.verify.simulation.hosts.world import MS, Host, S
 
 if TYPE_CHECKING:
@@ -57,7 +60,7 @@ class ParallelCalls:
 
 
 T = TypeVar("T")
-Steps: TypeAlias = Generator[Sleep | ParallelCalls, list[Answer | None], T]
+Steps: TypeAlias = Generator[Sleep | Stop | ParallelCalls, list[Answer | None], T]
 """A part of what a thread does, with what comes of it."""
 Thread: TypeAlias = Steps[None]
 
@@ -83,6 +86,7 @@ class ClientNode(Host):
         check_beliefs: Callable[[ClientNode], None],
         faults: Faults,
         ttl_ns: int,
+        sight: Sight = Sight.AWAY,
     ) -> None:
         super().__init__(world, name, drift_ppm=faults.drift_ppm, wall_offset_ns=0)
         session = f"{world.schedule.stream(f'session of {name}').getrandbits(64):016x}"
@@ -99,6 +103,16 @@ class ClientNode(Host):
         self._calls: dict[int, _Call] = {}
         self._calls_made = 0
         self._late_answers = world.schedule.place(f"{name}-late")
+        self._stopped: dict[int, Thread] = {}
+        self._stops = 0
+        self.kept = KeptLocks(
+            self.client,
+            sight,
+            world.schedule.stream(f"steps of {name}"),
+            marks_of=lambda shard: shards[shard].marks if shards[shard].up else None,
+            now=lambda: self.local_ns,
+            say=lambda shard, message: self.call(shard, message, lambda _answer: None),
+        )
 
     # ---------------------------------------------------------------- threads
 
@@ -115,8 +129,26 @@ class ClientNode(Host):
             return
         if isinstance(wish, Sleep):
             self.later(wish.duration_ns, lambda: self._resume(thread, None))
+        elif isinstance(wish, Stop):
+            self._stops += 1
+            self._stopped[self._stops] = thread
+            self.later(wish.duration_ns, partial(self._goes_on, self._stops))
         else:
             self._call_all(thread, wish)
+
+    def _goes_on(self, number: int) -> None:
+        """Let a thread go on that stands between two steps, unless it did so before."""
+        thread = self._stopped.pop(number, None)
+        if thread is not None:
+            self._resume(thread, None)
+
+    def acts(self) -> bool:
+        """Let one thread that stands between two steps take the next one now, if there is one."""
+        if not self.up or self.paused or not self._stopped:
+            return False
+        self.world.tally["steps while a shard looks at marks"] += 1
+        self._goes_on(next(iter(self._stopped)))
+        return True
 
     def _call_all(self, thread: Thread, wish: ParallelCalls) -> None:
         answers: list[Answer | None] = [None] * len(wish.calls)
@@ -243,6 +275,8 @@ class ClientNode(Host):
 
     def learn(self, shard: str, answer: Answer, *, sent_in: int = 0) -> None:
         """Take the catalogue that an answer carries, as `link.client.session` does."""
+        if isinstance(answer, Welcome):
+            self.kept.learn(shard, answer.epoch)
         if isinstance(answer, CATALOGUES):
             self.catalogue.learn(shard, answer, sent_in=sent_in)
             self.client.knows_types(shard, self.catalogue.successions(shard))
@@ -263,6 +297,8 @@ class ClientNode(Host):
                     self.learn(shard, answer)
                 lock.answered(shard, request, answer, self.local_ns)
             self._check_beliefs(self)
+        if lock.phase is not Phase.HELD:
+            yield from self.kept.leave(lock)
         for shard, farewell in lock.take_farewells():
             self.call(shard, farewell, lambda _answer: None)
 
@@ -270,4 +306,6 @@ class ClientNode(Host):
         """End silently: nothing is sent any more."""
         self.end_life()
         self._calls.clear()
+        self._stopped.clear()
+        self.kept.vanish()
         self.threads_left = 0

@@ -142,6 +142,9 @@ class Network:
         if doubled:
             world.tally["duplicated"] += 1
             world.befell(fault, f"{kind} comes twice")
+            if isinstance(message, m.Commit) and message.keep:
+                # Under a kept grant a copy does harm only once later locks have used it.
+                more_ns[1] = int(Random(luck).expovariate(1 / 0.8) * 1e9)
         if late:
             world.tally["delayed"] += 1
             seconds = Random(luck).expovariate(1 / 0.8)

@@ -21,11 +21,12 @@ from enact_dist.link.memory.payload_desk import PayloadDesk
 from enact_dist.verify.simulation.hosts.world import Host, S
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from enact_dist.core.protocol.messages import Answer, Request, WriteItem
     from enact_dist.core.protocol.records import Effect
     from enact_dist.core.shard.shard import Shard
+    from enact_dist.core.state.tenure import Tenure
 
 BYTES_MAX: Final = 64 << 20
 DRAFT_NS: Final = 30 * S
@@ -50,8 +51,9 @@ class HostClock:
 class ShardPayloads:
     """The payloads of one life of a shard, and who may still hold them."""
 
-    def __init__(self, host: Host, shard: Shard) -> None:
+    def __init__(self, host: Host, shard: Shard, is_unused: Callable[[Tenure], bool]) -> None:
         self._world, self._shard, self._host = host.world, shard, host
+        self._is_unused = is_unused
         self.desk = PayloadDesk(None, BYTES_MAX, clock=HostClock(host))
         self._adopted: dict[str, weakref.ref[PlainMemory]] = {}
         self._drafts: dict[str, tuple[str, int, int]] = {}
@@ -96,26 +98,35 @@ class ShardPayloads:
     def look(self) -> None:
         """Give up drafts as the shard's link does at each tick: those that must end, no others."""
         state, now_ns = self._shard.state, self._host.local_ns
-        sessions, holders = state.sessions.by_id, state.tenures.by_session
-        self.desk.sweep(sessions.__contains__, holders.__contains__)
-        left = self.desk.drafts()
+        sessions, before = state.sessions.by_id, self._holders()
+        self.desk.sweep(sessions.__contains__, state.tenures.works)
+        left, after = self.desk.drafts(), self._holders()
         for file in left:
             if file in self._adopted:
                 self._world.violation("a payload is made once", file)
         for file, (session, _, newest_ns) in list(self._drafts.items()):
             if session not in sessions:
                 over = "drafts end with their session"
-            elif session not in holders and now_ns - newest_ns > DRAFT_NS:
+            elif now_ns - newest_ns <= DRAFT_NS or session in before & after:
+                over = ""
+            elif session in before | after and file in left:
+                over = ""  # its client went on while the shard looked
+            else:
                 over = "drafts end after a time without a slice"
                 self._world.tally["drafts given up for want of slices"] += 1
-            else:
-                over = ""
             if over and file in left:
                 self._world.violation(over, file)
             if not over and file not in left:
                 self._world.violation("a draft stays while its client may commit it", file)
             if over:
                 del self._drafts[file]
+
+    def _holders(self) -> set[str]:
+        """Return the sessions with a lock, other than kept grants that they do not use."""
+        if not self._drafts:
+            return set()
+        tenures = self._shard.state.tenures.by_lock.values()
+        return {tenure.lock.session for tenure in tenures if not self._is_unused(tenure)}
 
     def check_released(self) -> None:
         """When nothing is under way, a payload lives as long as a slot or a reader shows it."""

@@ -17,6 +17,7 @@ from enact_dist.core.protocol.records import (
 )
 from enact_dist.core.shard.shard import Shard
 from enact_dist.verify.simulation.hosts.disk import Disk
+from enact_dist.verify.simulation.hosts.keeping import SimulatedMarks, SimulatedPage
 from enact_dist.verify.simulation.hosts.payloads import ShardPayloads, as_kept
 from enact_dist.verify.simulation.hosts.world import MS, Host, S
 
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
     from enact_dist.core.protocol.records import Effect, Event, Recovered
     from enact_dist.core.shard.state import ShardSettings
+    from enact_dist.core.state.tenure import Tenure
     from enact_dist.verify.simulation.faults import Faults
     from enact_dist.verify.simulation.hosts.network import Network
     from enact_dist.verify.simulation.hosts.world import SimulatedWorld
@@ -67,6 +69,9 @@ class ShardNode(Host):
         self.judge: ShardJudge
         self.shard: Shard
         self.payloads: ShardPayloads
+        self.keeps = False
+        self.marks: SimulatedMarks | None = None
+        self.between: Callable[[str], None] = lambda _session: None
         self.tokens: Callable[[ShardNode], list[str]] = lambda _host: []
         self.on_persist: Callable[[ShardNode], None] = lambda _host: None
         self.on_decision: Callable[[ShardNode, list[str]], None] = lambda _host, _told: None
@@ -75,7 +80,7 @@ class ShardNode(Host):
         self.asked: dict[int, Request] = {}
         self._replies: dict[int, Callable[[Answer], None]] = {}
         self._handle = self._steps = 0
-        self._stalled = False
+        self._stalled = self._deciding = False
         self._inbox: list[tuple[Request | Event, int]] = []
         self._tick_due_ns = 0
         self._crashed_at_ns = 0
@@ -90,7 +95,12 @@ class ShardNode(Host):
         self._replies.clear()
         self.asked.clear()
         self.shard = Shard(self.settings, recovered, now_ns=self.local_ns, wall_ns=self.wall_ns)
-        self.payloads = ShardPayloads(self, self.shard)
+        self.payloads = ShardPayloads(self, self.shard, self.is_unused)
+        if self.keeps:
+            if self.marks is not None:
+                self.marks.sweep()
+            self.marks = SimulatedMarks(self.shard.epoch, self.between, lambda: self.world.now_ns)
+            self.shard.state.tenures.kept.marks = self.marks
         self.judge.booted(self, recovered, crashed_at_ns=self._crashed_at_ns)
         self._tick_due_ns = 0
         self._plan_tick()
@@ -107,6 +117,8 @@ class ShardNode(Host):
         self.world.tally["power cuts" if power_cut else "crashes"] += 1
         self.end_life()
         self._stalled = False
+        if power_cut and self.marks is not None:
+            self.marks.sweep()
         self._inbox.clear()
         self._crashed_at_ns = self.world.now_ns
         self._tally_counters()
@@ -141,6 +153,21 @@ class ShardNode(Host):
         if self.up and inbox:
             self._give(Tick(), 0)
 
+    def is_living(self, tenure: Tenure) -> bool:
+        """Whether a grant is kept: its cell says so, or a block uses it to its end."""
+        page, number = self._page_of(tenure)
+        return page is not None and (number in page.numbers() or tenure.recalled)
+
+    def is_unused(self, tenure: Tenure) -> bool:
+        """Whether a grant is kept, and no block uses it: who wants it can have it at once."""
+        page, number = self._page_of(tenure)
+        return page is not None and number in page.numbers() and number not in page.marks
+
+    def _page_of(self, tenure: Tenure) -> tuple[SimulatedPage | None, int]:
+        if self.marks is None or tenure.token is None or tenure.bound or not tenure.kept:
+            return None, 0
+        return self.marks.made.get(tenure.lock.session), tenure.token.number
+
     def close(self) -> None:
         """Add this shard's own statistics to those of the run."""
         self._tally_counters()
@@ -164,15 +191,16 @@ class ShardNode(Host):
         if self._stalled:
             self._inbox.append((message, handle))
             return
+        if self._deciding:  # a client has gone on meanwhile, and something came of it at once
+            self.later(0, lambda: self._give(message, handle))
+            return
         now_ns, wall_ns = self.local_ns, self.wall_ns
         if isinstance(message, Tick):
             self.payloads.look()
-        effects = [
-            as_kept(effect)
-            for effect in self.shard.handle(
-                message, reply_to=handle, now_ns=now_ns, wall_ns=wall_ns
-            )
-        ]
+        self._deciding = True
+        decided = self.shard.handle(message, reply_to=handle, now_ns=now_ns, wall_ns=wall_ns)
+        self._deciding = False
+        effects = [as_kept(effect) for effect in decided]
         self._steps += 1
         if self.asserts and self._steps % ASSERT_EVERY == 0:
             self.shard.assert_invariants()

@@ -122,7 +122,12 @@ class ClientJudge:
                     host.own[slot] = (shard, epochs[shard], position.stamp_ns)
 
     def _check_confirmed(self, entry: Entry) -> None:
-        """P3: each part was asked, at its end, whether it had been held all the time."""
+        """P3: each part was asked, at its end, whether it had been held all the time.
+
+        A lock that has ended without a call was judged in that moment.
+        """
+        if entry.unasked:
+            return
         for part in entry.lock.parts:
             picture = self._observed.pictures[part.shard]
             if part.token != picture.confirmed.get(entry.id):

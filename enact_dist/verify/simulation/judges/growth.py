@@ -108,7 +108,7 @@ class GrowthJudge:
         """A datum became visible, in place of another one."""
         if slot.aspect not in picture.grown or entry.newer == slot.aspect:
             return
-        if entry.id in picture.late:
+        if picture.origin(entry.id) in picture.late:
             self._fail("a writer of the older type is refused", slot, entry.id)
         if datum is not None and before is not None and before.encoding == NEWER_ENCODING:
             self._fail("a new field is not dropped", slot, entry.id)

@@ -42,6 +42,7 @@ class Entry:
         ended_ns: When its thread learned how it ended (None: never, its process died).
         told: The outcome that its thread learned.
         newer: The aspect that it writes with the newer type ("": none).
+        unasked: It has ended under a kept grant, without writes and without a call.
     """
 
     lock: MultiLock
@@ -52,6 +53,7 @@ class Entry:
     told: Phase | None = None
     expects: bool = False
     newer: str = ""
+    unasked: bool = False
 
     @property
     def id(self) -> LockId:

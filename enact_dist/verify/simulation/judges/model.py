@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from enact_dist.core.protocol.datum import Datum, LockId, Slot
 from enact_dist.core.protocol.messages import (
+    Commit,
     Committed,
     Finished,
     Forgotten,
@@ -27,6 +28,7 @@ from enact_dist.core.protocol.messages import (
     Surveyed,
     TakeView,
     Valid,
+    Validate,
     Versions,
     Viewed,
 )
@@ -51,7 +53,7 @@ from enact_dist.verify.simulation.judges.causes import CauseJudge
 from enact_dist.verify.simulation.judges.clients import ClientJudge
 from enact_dist.verify.simulation.judges.growth import GrowthJudge
 from enact_dist.verify.simulation.judges.history import TOLD_NOT, Observations
-from enact_dist.verify.simulation.judges.locks import LockJudge
+from enact_dist.verify.simulation.judges.locks import KeepingJudge, LockJudge
 from enact_dist.verify.simulation.judges.past import PastJudge
 from enact_dist.verify.simulation.judges.picture import CommittedState, ShardPicture
 from enact_dist.verify.simulation.judges.prefixes import judge_prefixes
@@ -81,6 +83,7 @@ class Model(Observations):
         versions = {entry.name: limits_of(entry).versions for entry in aspects}
         self.growth = GrowthJudge(world)
         self.of_clients = ClientJudge(self, self.growth)
+        self.keeping = KeepingJudge(self)
         self.labels: dict[tuple[str, str], Slot] = {}
         self._locks = LockJudge(world)
         self._causes = CauseJudge(world, history)
@@ -180,6 +183,8 @@ class Model(Observations):
         picture.arrivals.clear()
         picture.granted.clear()
         picture.granted_ever.clear()
+        picture.holders.clear()
+        picture.under.clear()
         for promise in recovered.prepared:
             lock = promise.lock
             self.world.tally["prepared over a restart"] += 1
@@ -188,6 +193,7 @@ class Model(Observations):
                 self.fail("I10 prepared locks are held again", lock)
             picture.prepared[lock] = promise
             picture.granted[lock] = picture.granted_ever[lock] = promise.token
+            picture.holders[promise.token] = lock
             picture.arrivals[lock] = 0
         picture.notices = 0
         longest_ns = max((record.ttl_ns for record in recovered.sessions), default=0)
@@ -203,11 +209,14 @@ class Model(Observations):
         ended = isinstance(message, Goodbye | SessionDied)
         if isinstance(message, Hello | Goodbye | SessionDied) and (acknowledged or ended):
             picture.grace_waits_for.pop(message.session, None)
+        if isinstance(message, Commit | Validate):
+            picture.named(message.lock, message.token)
         self._worlds.judge(host, effects, picture)
         self._check_commits(host, effects, picture)
         self._worlds.check_told()
         self.growth.handled(host, message, effects, picture)
         self._locks.judge(host, message, picture)
+        self.keeping.handled(host, message, effects, picture)
         if isinstance(message, KeepVersions):
             self._pasts.take_keep(host, message, picture)
         for effect in effects:
@@ -226,8 +235,8 @@ class Model(Observations):
                 self._readers.check_survey(message, effect.answer, picture)
             elif isinstance(effect.answer, Valid):
                 lock = effect.answer.lock
-                if lock in picture.granted_ever:  # else it only expected something here
-                    picture.confirmed[lock] = picture.granted_ever[lock]
+                if picture.origin(lock) in picture.granted_ever:  # else it only expected something
+                    picture.confirmed[lock] = picture.granted_ever[picture.origin(lock)]
 
     def _judge_past(self, answer: object, asked: TakeView, picture: ShardPicture) -> None:
         if isinstance(answer, Viewed):
@@ -339,7 +348,7 @@ class Model(Observations):
         """A commit became visible."""
         persist = picture.in_flight.pop(lock, None)
         self._check_on_disk(host, lock, persist, notice)
-        if picture.granted.get(lock) is None:
+        if picture.granted.get(picture.origin(lock)) is None:
             self.fail("the fence: only a holder commits", lock)
         if [(c.slot, c.version) for c in notice.changes] != expected:
             self.fail("a notice tells what was committed", notice, expected)
@@ -355,7 +364,7 @@ class Model(Observations):
                 self.fail("a notice tells what was committed", change, datum)
         self._put_all(lock, versions, picture, datum_of)
         picture.applied[lock] = persist
-        picture.confirmed[lock] = picture.granted_ever[lock]
+        picture.confirmed[lock] = picture.granted_ever[picture.origin(lock)]
         self._causes.applied(host, lock, notice)
         self.world.tally["commits"] += 1
 
@@ -395,7 +404,7 @@ class Model(Observations):
         versions = {slot: (version, stamp_ns) for slot, version in outcome.versions}
         self._put_all(lock, versions, picture, datum_of)
         picture.applied[lock] = persist
-        picture.confirmed[lock] = picture.granted_ever[lock]
+        picture.confirmed[lock] = picture.granted_ever[picture.origin(lock)]
         self.world.tally["commits"] += 1
 
     def _put_all(

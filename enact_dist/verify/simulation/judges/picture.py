@@ -42,7 +42,9 @@ class ShardPicture:
     stamp at which this epoch began, `promised` up to which stamp the past of a slot was shown in
     it, and `labels` what each label keeps.  `vanished` are the slots of which the last crash has
     taken even that they were there.  `grown` are the aspects with a newer type that the shard has
-    acknowledged, and `late` the locks that it has queued since then.
+    acknowledged, and `late` the locks that it has queued since then.  `holders` are the locks that
+    were granted in this epoch, by their tokens, and `under` the one whose kept grant a later lock
+    of its session has named while it lived.
     """
 
     epoch: int = 0
@@ -57,6 +59,8 @@ class ShardPicture:
     arrivals: dict[LockId, int] = field(default_factory=dict)
     granted: dict[LockId, Token] = field(default_factory=dict)
     granted_ever: dict[LockId, Token] = field(default_factory=dict)
+    holders: dict[Token, LockId] = field(default_factory=dict)
+    under: dict[LockId, LockId] = field(default_factory=dict)
     confirmed: dict[LockId, Token] = field(default_factory=dict)
     lanes: dict[tuple[str, int], None] = field(default_factory=dict)
     came: int = 0
@@ -74,6 +78,19 @@ class ShardPicture:
     confirmed_labels: dict[str, None] = field(default_factory=dict)
     grown: dict[str, AspectEntry] = field(default_factory=dict)
     late: dict[LockId, None] = field(default_factory=dict)
+
+    def named(self, lock: LockId, token: Token) -> None:
+        """Note under whose grant a lock ends that was never granted by itself."""
+        origin = self.holders.get(token)
+        if lock in self.granted_ever or origin is None or origin.session != lock.session:
+            return
+        if self.granted.get(origin) == token:
+            self.under[lock] = origin
+            self.lanes[lock[:2]] = None
+
+    def origin(self, lock: LockId) -> LockId:
+        """Return the lock whose grant a lock has: its own, or a kept one."""
+        return self.under.get(lock, lock)
 
     def now(self, slot: Slot) -> CommittedState:
         """Return the newest committed state of a slot."""

@@ -38,6 +38,7 @@ from enact_dist.verify.simulation.hosts.world import MS, S
 from enact_dist.verify.simulation.judges.causes import reads_of
 from enact_dist.verify.simulation.judges.growth import OLDER
 from enact_dist.verify.simulation.judges.history import Entry, RunHistory
+from enact_dist.verify.simulation.work import keeping
 from enact_dist.verify.simulation.work.captures import Captures, drawn_stamp_ns
 from enact_dist.verify.simulation.work.growth import ATTEMPTS_MAX, Growth
 from enact_dist.verify.simulation.work.staging import Stager
@@ -116,6 +117,7 @@ class Workload:
         # With one entity nearly all locks want the same few slots.
         one = world.schedule.stream("the one aspect").choice(PLAIN)
         self._aspects = PLAIN if entities > 1 else (one,)
+        self.keepers = keeping.Keepers(world, model, entities=self._entities, aspects=self._aspects)
 
     # ---------------------------------------------------------------- drawing
 
@@ -251,12 +253,30 @@ class Workload:
         random = schedule.stream(f"work of {host.name} in lane {lane}")
         while not self._world.winding_down:
             yield Sleep(random.choice((0, 5 * MS, 30 * MS, 150 * MS)))
-            job = self.job(f"{host.name}/{lane}.{number}", Random(random.getrandbits(64)))
-            number += 1
-            if schedule.begins(job.name):
-                yield from self.do(host, lane, job)
-            else:
-                yield Sleep(job.work_ns + MS)
+            luck = Random(random.getrandbits(64))
+            items, times = self.keepers.repeats(luck)
+            for again in range(times):
+                job = self.job(f"{host.name}/{lane}.{number}", luck)
+                if items:
+                    job = self._repeated(job, items)
+                number += 1
+                if schedule.begins(job.name):
+                    yield from self.do(host, lane, job)
+                else:
+                    yield Sleep(job.work_ns + MS)
+                if again == times - 1 or self._winds_down():
+                    break
+                yield Sleep(luck.choice(keeping.RESTS_NS))
+
+    def _winds_down(self) -> bool:
+        return self._world.winding_down
+
+    @staticmethod
+    def _repeated(job: Job, items: tuple[Item, ...]) -> Job:
+        """Return a job like another one that is done once more with the same data."""
+        luck = Random(job.luck.getrandbits(64))
+        work_ns = luck.choice(keeping.WORKS_NS)
+        return replace(job, kind="increment", items=items, luck=luck, work_ns=work_ns)
 
     def do(
         self, host: ClientNode, lane: int, job: Job, *, lock_views: bool = False, attempt: int = 1
@@ -269,16 +289,24 @@ class Workload:
         items = tuple(self._with_known(host, item) for item in job.items)
         if job.kind in SETS:
             items = yield from self._captures.stamped(host, items, job.luck)
-        lock = client.begin(
-            lane,
-            client.plan(items, lock_views=lock_views),
-            now_ns=host.local_ns,
-            wait_ns=job.wait_ns,
-            hold_ns=job.hold_ns,
-        )
-        own = dict(host.own)
-        entry = Entry(lock, items, job.kind, self._world.now_ns, newer=newer)
+        begun_ns, own = self._world.now_ns, dict(host.own)
+        lock = yield from self.keepers.begin(host, lane, job.items, hold_ns=job.hold_ns)
+        kept = lock is not None
+        if lock is None:
+            begun_ns, own = self._world.now_ns, dict(host.own)
+            lock = client.begin(
+                lane,
+                client.plan(items, lock_views=lock_views),
+                now_ns=host.local_ns,
+                wait_ns=job.wait_ns,
+                hold_ns=job.hold_ns,
+            )
+            if not lock_views:
+                self.keepers.may_keep(host, lock, job.items)
+        entry = Entry(lock, items, job.kind, begun_ns, newer=newer)
         self._history.begin(entry)
+        if kept:
+            self._model.keeping.begun(entry)
         self._world.tell(job.name, "asks for", *map(told_of, items))
         yield from host.drive(lock)
         if lock.phase is Phase.HELD:
@@ -299,6 +327,7 @@ class Workload:
             elif lock.phase is Phase.HELD:
                 yield from self._finish(host, entry, job, data)
             yield from host.drive(lock)
+        yield from self.keepers.asked_later(host, entry, job.luck)
         self._history.end(entry, now_ns=self._world.now_ns)
         self._world.tell(job.name, "ends as", entry.told.value if entry.told else "-", lock.cause)
         self._model.of_clients.told(host, entry)
@@ -370,6 +399,10 @@ class Workload:
             writes.setdefault(shard, []).append(
                 WriteItem(slot, self._datum(entry, job, slot, data))
             )
+        if not writes and (yield from host.kept.finish(lock)):
+            entry.unasked = True
+            self._model.keeping.ended(entry)
+            return
         for shard, items in writes.items():
             writes[shard] = yield from self._stager.staged(
                 host, shard, items, job.luck, rests_ns=job.rests_ns
