@@ -34,7 +34,15 @@ README = ROOT / "README.md"
 PAGES = sorted((ROOT / "enact_dist" / "docs").glob("*.md"))
 DEPLOY = sorted((ROOT / "deploy").rglob("*.md"))
 ALL = [README, *PAGES, *DEPLOY]
-FOLLOWED = {"own_cell.md", "cell.md", "operations.md", "own_actors.md", "protocol.md", "drills.md"}
+FOLLOWED = {
+    "own_cell.md",
+    "cell.md",
+    "kept_grants.md",
+    "operations.md",
+    "own_actors.md",
+    "protocol.md",
+    "drills.md",
+}
 """Pages whose consoles are followed in `tests/e2e`."""
 KINDS = {"python", "console", "toml", "sh", "text"}
 _BLOCK = re.compile(

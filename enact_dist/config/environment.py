@@ -6,8 +6,9 @@ capitals, with ``_`` for ``.`` and ``-``.  ``ENACT_DATA_FOLDER`` concerns shards
 of their own; lists are comma separated.  Relative folders are relative to the working folder.  An
 empty variable counts as none.  One that starts with ``ENACT_SHARD_`` and names no shard or no such
 key, or that is close to one of the others, is a `ConfigError`: a misspelt override must not end as
-a silent default.  `ENACT_CELL` (which cell the command line talks to) and `ENACT_SHARED_FOLDER`
-(where processes of one host meet, see `link.memory.shared_folder`) are no keys of the file.
+a silent default.  `ENACT_CELL` (which cell the command line talks to), `ENACT_SHARED_FOLDER` (where processes of one
+host meet, see `link.memory.shared_folder`) and `ENACT_RETAIN` (whether grants are kept, see
+`link.memory.use_marks`) are no keys of the file.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ def variables_of(kind: type) -> dict[str, Field]:
 _CELL_NAMES: Final = (
     *(f"ENACT_{name}" for name in variables_of(CellConfig)),
     "ENACT_SHARED_FOLDER",
+    "ENACT_RETAIN",
 )
 _SHARD_PREFIX: Final = "ENACT_SHARD_"
 _CLOSE: Final = 0.85
@@ -57,7 +59,7 @@ def with_environment(config: CellConfig, environment: Mapping[str, str]) -> Cell
 
 def without_overrides(environment: Mapping[str, str]) -> dict[str, str]:
     """Return `environment` without overrides, for processes that follow their `cell.toml`."""
-    overrides = set(_CELL_NAMES) - {"ENACT_SHARED_FOLDER"}
+    overrides = set(_CELL_NAMES) - {"ENACT_SHARED_FOLDER", "ENACT_RETAIN"}
     return {
         name: text
         for name, text in environment.items()

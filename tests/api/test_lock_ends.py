@@ -71,7 +71,7 @@ def interrupt():
 
 
 def assert_nothing_left(cell, online):
-    assert cell.locks() == ()
+    assert [info for info in cell.locks() if info.state != "kept"] == []
     assert cell._client.core.live_locks() == []
     with Lock(Write(online, bench, COUNT), wait_s=0):
         assert cell._client._lanes._made == 1

@@ -6,6 +6,7 @@ import pytest
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
 from enact_dist.cli.main import main
+from enact_dist.errors import LeaseLostError
 
 COUNT = Aspect("count", int)
 PINNED = '[[pins]]\nentities = "**"\nshard = "left"\n'
@@ -60,6 +61,36 @@ def test_ls_shows_the_holder_and_who_waits_for_whom(at, cell, spawn, cell_file):
     assert f"{holder['number']} (painter@{holder['host']} pid {holder['pid']})" in line
 
 
+def test_ls_shows_which_grants_are_kept_and_break_takes_them_away(at, cell):
+    """Between two blocks one is `kept`, in a block `kept, used`; broken it is asked for anew."""
+
+    def shown():
+        (line,) = [line for line in at("ls").out.splitlines() if "kept/count" in line]
+        (lock,) = [lock for lock in at("ls", "--json").json if "kept/count" in lock["slots"][0]]
+        return line, lock
+
+    request = slot(cell, "kept")
+    for _ in range(4):
+        with Lock(request) as held:
+            held[request] = held.get(request, 0) + 1
+    line, lock = shown()
+    assert " kept  " in line
+    assert (lock["kept"], lock["granted"]) == ("unused", True)
+
+    broken = at("break", lock["number"], "--reason", "not needed")
+    assert f"broke lock {lock['number']} on left, kept by painter@" in broken.out
+    for _ in range(4):
+        with Lock(request) as held:
+            held[request] += 1
+    with pytest.raises(LeaseLostError, match="used too long"), Lock(request) as held:
+        line, lock = shown()
+        assert " kept, used  " in line
+        assert at("break", lock["number"], "--reason", "used too long").status == 0
+        held[request] = 99
+    with Lock(request) as held:
+        assert held[request] == 8
+
+
 def test_hold_passes_on_the_status_of_its_command(at):
     """The command runs while the lock is held, and its status is ours."""
     assert at("hold", "online:piece/count:write", "--", "sh", "-c", "exit 7").status == 7
@@ -72,7 +103,7 @@ def test_hold_holds_while_its_command_runs(at, cell, spawn, until, cell_file):
     hold = spawn("lock", "hold", "--cell", cell_file, "online:piece/count:write", "--",
                  "sh", "-c", command, stdin=-1)  # fmt: skip
     until(hold, "running")
-    names = [lock["actor"] for lock in at("ls", "--json").json]
+    names = [lock["actor"] for lock in at("ls", "--json").json if lock["kept"] != "unused"]
     hold.stdin.write("\n")
     hold.stdin.close()
     until(hold, "done")
@@ -88,7 +119,8 @@ def test_hold_kills_its_command_and_fails_when_the_lock_is_broken(at, spawn, unt
     hold = spawn("lock", "hold", "--cell", cell_file, "online:piece/count:write", "--",
                  "sh", "-c", "echo running; sleep 60; echo survived")  # fmt: skip
     until(hold, "running")
-    number = at("ls", "--json").json[0]["number"]
+    locks = at("ls", "--json").json
+    (number,) = [lock["number"] for lock in locks if lock["actor"] == "hold:sh"]
 
     broken = at("break", number, "--reason", "wrong piece")
     rest = hold.stdout.read()
@@ -167,7 +199,7 @@ def test_hold_is_refused_before_anything_runs(at, words, status, reason):
 
     assert result.status == status
     assert reason in result.err
-    assert at("ls", "--json").json == []
+    assert [lock for lock in at("ls", "--json").json if lock["kept"] != "unused"] == []
 
 
 def test_hold_times_out_with_the_holders_name(at, cell):

@@ -78,7 +78,7 @@ def test_transfers_between_shards_keep_the_sum_when_shards_are_killed(cell):
     assert total(cell) == TOTAL
     assert seen["sums"] == [TOTAL], seen
     with connect(cell.file) as joined:
-        until(lambda: not joined.locks(), joined.locks)
+        until(lambda: all(lock.state == "kept" for lock in joined.locks()), joined.locks)
         until(lambda: finished(joined), joined.shards)
 
 
@@ -87,7 +87,7 @@ def test_lock_in_doubt_is_told_and_given_up_by_hand(cell):
     holder = cell.worker("hold")
     holder.expect("holding")
     with connect(cell.file) as joined:
-        (held,) = [lock for lock in joined.locks() if lock.granted]
+        (held,) = [lock for lock in joined.locks() if lock.state == "held"]
 
     done = cell.enact(
         "lock", "resolve", "--force-abort", str(held.number), "--shard", held.shard, "--reason", "x"

@@ -23,9 +23,9 @@ def follow(page, folder):
 
 
 @pytest.mark.carrier("auto")
-@pytest.mark.parametrize("name", ["protocol", "cell"])
+@pytest.mark.parametrize("name", ["protocol", "cell", "kept_grants"])
 def test_a_page_does_what_it_says(name, tmp_path):
-    """The client without the library commits; the misspelt cell is refused."""
+    """The client without the library commits; the misspelt cell is refused; a grant stays."""
     follow(DOCS / f"{name}.md", tmp_path)
 
 

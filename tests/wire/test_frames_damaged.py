@@ -28,6 +28,11 @@ def header_of(code, *fields, version=VERSION):
     return msgpack.packb([version, code, *fields])
 
 
+def commit_of(*writes):
+    """Return the header of a commit with these writes, whatever they are."""
+    return header_of(7, list(LOCK), [1, 1], list(writes), 0, [], [], [], 0, False, 0)
+
+
 def accepted(header, payload):
     """Return whether a frame is read; what is read must be sendable and come back equal."""
     try:
@@ -112,7 +117,7 @@ def test_frame_with_a_field_of_another_type_is_refused(cls):
 def test_frame_with_a_list_of_other_types_is_refused(entry):
     """The entries of a list are checked too: texts here, integers in a holder's list."""
     waits_for = "a" if entry == 1 and entry is not True else entry
-    holder = [list(LOCK), 1, "a", "h", 1, True, "w", 0, 0, 0, [], [7, waits_for]]
+    holder = [list(LOCK), 1, "a", "h", 1, True, "w", 0, 0, 0, [], [7, waits_for], ""]
 
     with pytest.raises(ProtocolError, match="a list of str"):
         decode_frame(header_of(13, ["online", entry], [], [], False, [0, [], 0, 0]))
@@ -171,7 +176,7 @@ def test_frame_with_a_body_elsewhere_is_refused(offset, size):
     write = [list(SLOT), [b"\x01\x00", offset, size, 0, ""]]
 
     with pytest.raises(ProtocolError):
-        decode_frame(header_of(7, list(LOCK), [1, 1], [write], 0, [], [], [], 0), b"x" * 100)
+        decode_frame(commit_of(write), b"x" * 100)
 
 
 def test_frame_bodies_cannot_overlap():
@@ -179,7 +184,7 @@ def test_frame_bodies_cannot_overlap():
     write = [list(SLOT), [b"\x01\x00", 0, 100, 0, ""]]
 
     with pytest.raises(ProtocolError, match="expected at 128"):
-        decode_frame(header_of(7, list(LOCK), [1, 1], [write, write], 0, [], [], [], 0), b"x" * 100)
+        decode_frame(commit_of(write, write), b"x" * 100)
 
 
 @pytest.mark.parametrize("mark", [b"\xdd", b"\xdf", b"\xdb", b"\xc6", b"\xc9"])
@@ -259,7 +264,7 @@ def test_frame_with_a_payload_that_cannot_be_is_refused(file, offset, size):
     write = [list(SLOT), [b"\x01\x00", offset, size, 0, file]]
 
     with pytest.raises(ProtocolError, match=r"payload|character"):
-        decode_frame(header_of(7, list(LOCK), [1, 1], [write], 0, [], [], [], 0))
+        decode_frame(commit_of(write))
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,8 @@ import pytest
 from enact_dist import errors
 from enact_dist.core.protocol import messages as m
 from enact_dist.core.protocol.datum import Datum
+from enact_dist.core.state import tenure
+from enact_dist.link.memory.use_marks import PAGE_BYTES, page_name
 from enact_dist.link.refusals import error_of
 from enact_dist.link.socket import frames as stream
 from enact_dist.terms import Access
@@ -217,6 +219,15 @@ def test_limits_are_those_of_the_page():
     compare("Limits", [(name, f"{getattr(limits, name):,}") for name in names], 2)
     defined = {name for name in vars(limits)["__annotations__"] if name.endswith("_MAX")}
     assert defined - set(names) == set(), "limits that the page does not have"
+
+
+def test_kept_grants_have_the_figures_of_the_page():
+    """File, cells and answers, by which another language keeps grants."""
+    assert f"the file `{page_name('SESSION')}` in the shard's folder, {PAGE_BYTES} bytes" in TEXT
+    assert f"{tenure.KEPT_OF_SESSION_MAX} cells, unsigned integers of 8 bytes" in TEXT
+    assert (m.NOT_KEPT, m.PROVE, m.PLACES) == (0, 1, 2)
+    assert f"is {m.NOT_KEPT} (the grant is over), {m.PROVE} (it is over, and the client" in TEXT
+    assert f"or {m.PLACES} + *n*: the grant stays, and cell *n*" in TEXT
 
 
 def test_refusals_raise_what_the_page_says():

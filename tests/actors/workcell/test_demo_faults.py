@@ -128,8 +128,8 @@ class Trial:
         return safety if text in safety.reason else None
 
     def locks(self, pid: int) -> list[LockInfo]:
-        """Return the locks that a process holds or waits for."""
-        return [one for one in self.cell.locks() if one.pid == pid]
+        """Return the locks that a process holds or waits for, without what is merely kept."""
+        return [one for one in self.cell.locks() if one.pid == pid and one.state != "kept"]
 
     @contextlib.contextmanager
     def stopped(self, name: str, *, holding: bool = False) -> Iterator[list[LockInfo]]:
