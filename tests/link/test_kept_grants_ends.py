@@ -11,8 +11,8 @@ import time
 
 import numpy as np
 import pytest
-from kept_processes import RETAINER, heard, keep, kept_of, slot, used_again
-from socket_parts import CUP, add_one, counters
+from kept_processes import RETAINER, Waiting, heard, keep, kept_of, slot, used_again
+from socket_parts import COUNT, CUP, add_one, counters
 
 from enact_dist import Aspect, Durability, Entity, Lock, Read, Write, connect
 from enact_dist.core.protocol.messages import Goodbye
@@ -142,6 +142,23 @@ def test_page_goes_with_its_session(shard, endpoint, two):
     assert cell.locks() == ()
 
 
+@drawn
+def test_grant_that_is_merely_kept_is_no_lost_lock_and_holds_no_context(shard, endpoint, two):
+    """Its context can be dropped; the end of its session is no loss, on which alarms look."""
+    cell, other = two
+    cell.create_world("trial")
+    trial = Write(cell.world("trial"), CUP, COUNT)
+    keep(cell, trial)
+
+    other.drop_world("trial")
+
+    with connect(endpoint) as third:
+        keep(third, slot(third, Entity("plate")))
+        third._client.carrier.request("s0", Goodbye(third._client.core.session), timeout_s=30)
+    assert [info for info in cell.locks() if info.state != "kept"] == []
+    assert not {"leases_expired", "sessions_died", "fenced"} & set(counters(shard))
+
+
 # ---------------------------------------------------------------- pages that cannot be used
 
 
@@ -249,6 +266,28 @@ def test_grant_is_asked_for_where_its_mark_cannot_be_taken(two, monkeypatch):
     add_one(other)
     add_one(cell)
     assert kept_of(cell) == {}
+
+
+@drawn
+def test_shard_goes_on_where_the_kernel_does_not_say_what_is_marked(shard, two, monkeypatch, until):
+    """In doubt a block uses the grant: it is recalled, and over when the shard looks again."""
+    cell, other = two
+    keep(cell, slot(cell))
+    real = fcntl.fcntl
+
+    def refuses(descriptor, command, *arguments):
+        if command == fcntl.F_OFD_GETLK:
+            raise OSError(errno.EIO, "no answer")
+        return real(descriptor, command, *arguments)
+
+    with monkeypatch.context() as doubtful:
+        doubtful.setattr(fcntl, "fcntl", refuses)
+        waiting = Waiting(slot(other))
+        until(lambda: counters(shard).get("grants_recalled"))
+        assert not waiting.granted.is_set()
+    waiting.end()
+
+    assert shard.host.failure is None
 
 
 # ---------------------------------------------------------------- what is cut off

@@ -95,6 +95,14 @@ class ShardPage:
         kind: int = _LOCK.unpack(found)[0]
         return kind != fcntl.F_UNLCK
 
+    def has(self, byte: int, *, in_doubt: bool) -> bool:
+        """As `locked`, for a caller that cannot do without an answer."""
+        try:
+            return self.locked(byte)
+        except OSError as error:
+            _log.warning("the kernel does not say whether byte %d is locked: %s", byte, error)
+            return in_doubt
+
     def set(self, place: int, number: int) -> None:
         """Set a cell; 0 clears it."""
         self.cells[place] = number
@@ -119,7 +127,7 @@ class ShardMarks:
                 self._pages[session] = self._made(session)
                 return PROVE if self._pages[session] is not None else NOT_KEPT
             return NOT_KEPT
-        page.proven = page.proven or page.locked(PROOF)
+        page.proven = page.proven or page.has(PROOF, in_doubt=False)
         if not page.proven or not page.free:
             return NOT_KEPT if page.proven else PROVE
         return PLACES + page.put(number)
@@ -152,9 +160,9 @@ class ShardMarks:
         return not self.used(session, number)
 
     def used(self, session: str, number: int) -> bool:
-        """Whether a block uses the grant now."""
+        """Whether a block uses the grant now; in doubt it does, and ends by its hold limit."""
         page = self._pages.get(session)
-        return page is not None and page.locked(number)
+        return page is not None and page.has(number, in_doubt=True)
 
     def over(self, session: str, number: int) -> None:
         """Clear a grant's cell; another grant may have it.
