@@ -479,7 +479,7 @@ class Lock(Triggered):
     def token(self) -> tuple[tuple[str, int, int], ...]:
         """Fencing numbers (shard, epoch, number), for outside devices that compare them.
 
-        Of two grants of one shard the later one has the larger (epoch, number).
+        Of two grants of one shard the later has the larger (epoch, number); blocks may share one.
         """
         parts = self._lock.parts if self._lock is not None else []
         return tuple((p.shard, p.token.epoch, p.token.number) for p in parts if p.token)

@@ -6,7 +6,9 @@ capitals, with ``_`` for ``.`` and ``-``.  ``ENACT_DATA_FOLDER`` concerns shards
 of their own; lists are comma separated.  Relative folders are relative to the working folder.  An
 empty variable counts as none.  One that starts with ``ENACT_SHARD_`` and names no shard or no such
 key, or that is close to one of the others, is a `ConfigError`: a misspelt override must not end as
-a silent default.  `ENACT_CELL` (which cell the command line talks to), `ENACT_SHARED_FOLDER` (where processes of one
+a silent default.
+
+`ENACT_CELL` (which cell the command line talks to), `ENACT_SHARED_FOLDER` (where processes of one
 host meet, see `link.memory.shared_folder`) and `ENACT_RETAIN` (whether grants are kept, see
 `link.memory.use_marks`) are no keys of the file.
 """

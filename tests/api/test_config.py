@@ -415,6 +415,7 @@ WRONG_ENVIRONMENT = [
     ("ENACT_SESSION_TTL_S", "nan", "ENACT_SESSION_TTL_S='nan' is no number of seconds"),
     ("ENACT_CARRIER", "mqtt", r"ENACT_CARRIER='mqtt' is unknown \(known: auto, zenoh, socket\)"),
     ("ENACT_SESSION_TTL", "2", "did you mean ENACT_SESSION_TTL_S"),
+    ("ENACT_RETAINS", "0", "did you mean ENACT_RETAIN"),
     ("ENACT_SHARD_LEFT_DRAIN_S", "ever", "ENACT_SHARD_LEFT_DRAIN_S='ever' is no number of seconds"),
     ("ENACT_SHARD_LEFT_LISTN", "x", "did you mean 'ENACT_SHARD_LEFT_LISTEN'"),
     ("ENACT_SHARD_LEFT_LISTN", "", "did you mean 'ENACT_SHARD_LEFT_LISTEN'"),
