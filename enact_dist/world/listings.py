@@ -117,8 +117,8 @@ class LockInfo:
         modes: "read", "write" or both.
         waits_for: Numbers of the locks that block it.
         kept: How a grant is used that stays with its session between two blocks: "unused" (it ends
-            as soon as somebody asks for its data), "used", or "recalled" (used, and over with that
-            block); "" of any other lock.
+            as soon as another lock asks for its data), "used", or "recalled" (used, and over with
+            that block); "" of any other lock.
     """
 
     shard: str
@@ -138,7 +138,7 @@ class LockInfo:
 
     @property
     def state(self) -> str:
-        """How it stands, as `enact lock ls` shows it; "kept" is in nobody's way."""
+        """How it stands, as `enact lock ls` shows it; "kept" delays no other lock."""
         if not self.granted:
             return "waits"
         return _STATES.get(self.kept, "held")

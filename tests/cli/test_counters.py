@@ -12,6 +12,7 @@ from enact_dist.link.memory.payload_desk import PayloadDesk
 
 OF_CLIENTS = (
     "client/locks.py",
+    "client/kept.py",
     "client/fetch.py",
     "memory/payload_client.py",
     "client/catalogue.py",
@@ -36,8 +37,8 @@ def counted(paths):
                 table = getattr(node.target.value, "attr", getattr(node.target.value, "id", ""))
                 if table in TABLES and isinstance(node.target.slice, ast.Constant):
                     names.add(node.target.slice.value)
-            elif isinstance(node, ast.AugAssign) and isinstance(node.target, ast.Subscript):
-                table, key = node.target.value, node.target.slice
+            elif isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Subscript):
+                table, key = node.targets[0].value, node.targets[0].slice
                 named = getattr(table, "attr", "").lstrip("_") == "counters"
                 if named and isinstance(key, ast.Constant):
                     names.add(key.value)

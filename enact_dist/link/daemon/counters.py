@@ -53,9 +53,11 @@ OF_A_SHARD: Final[dict[str, Figure]] = {
     "locks_validated": Figure("locks without a write here, confirmed when they ended"),
     "grants_kept": Figure("grants that stayed with their session, for its next locks of the data"),
     "grants_not_kept": Figure("grants that could not stay: no page of marks, or no room in it"),
-    "grants_revoked": Figure("kept grants that ended unused, because somebody asked for the data"),
+    "grants_revoked": Figure(
+        "kept grants that ended unused, because another lock asked for the data"
+    ),
     "grants_recalled": Figure(
-        "kept grants in use when somebody asked; each ended with the block that used it"
+        "kept grants in use when another lock asked; each ended with the block that used it"
     ),
     "lock_waits": Figure(
         "locks that had to wait", "if too many: hold locks for less time, or use View"

@@ -252,7 +252,7 @@ class Scenario:
                 )
 
     def _check_given_up(self) -> None:
-        """I12: a shard that is told to stop takes all grants back at once that nobody uses."""
+        """I12: a shard that has to stop takes all unused grants back at once."""
         for host in self.shards.values():
             host.event(Drain())
             if host.shard.state.tenures.by_lock or not host.shard.idle:
@@ -297,5 +297,5 @@ class Scenario:
 
 
 def _locks_left(host: ShardNode) -> list[Tenure]:
-    """Return the locks of a shard without the kept grants that nobody uses."""
+    """Return the locks of a shard without the kept grants that no block uses."""
     return [t for t in host.shard.state.tenures.by_lock.values() if not host.is_unused(t)]

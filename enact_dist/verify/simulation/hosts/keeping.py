@@ -91,7 +91,7 @@ class SimulatedPage(ShardPage):
         super().set(place, number)
 
     def wipe(self) -> None:
-        """Clear all cells: whoever may look at them again finds no grant of this start."""
+        """Clear all cells: a client that looks at them again finds no grant of this start."""
         for place in range(KEPT_OF_SESSION_MAX):
             self.set(place, 0)
 
@@ -116,7 +116,7 @@ class SimulatedPage(ShardPage):
             self.freed_ns[number] = self._now()
 
     def vanish(self) -> None:
-        """Let go of all marks, as the kernel does when a process ends or closes the file."""
+        """Free all marks, as the kernel does when a process ends or closes the file."""
         for number in list(self.marks):
             self.unmark(number)
 

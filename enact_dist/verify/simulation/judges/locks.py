@@ -166,7 +166,7 @@ class LockJudge:
 
 
 class KeepingJudge:
-    """Looks at pages, at blocks that begin and end without a call, and at who waits for them."""
+    """Looks at pages, at blocks that begin and end without a call, and at the waiters."""
 
     def __init__(self, observed: Observations) -> None:
         self._observed, self._fail = observed, observed.fail
@@ -239,7 +239,7 @@ class KeepingJudge:
             self._observed.count("late commits under a living grant fenced", lives)
 
     def _check_waiters(self, host: ShardNode, kept: list[Tenure]) -> None:
-        """R4: who waits for a kept grant waits for a block, whose client finds the cell cleared."""
+        """R4: a waiter behind a kept grant waits for a block; its client finds the cell cleared."""
         marks = host.marks
         assert marks is not None
         for waiter in host.shard.state.tenures.by_lock.values():
@@ -255,7 +255,7 @@ class KeepingJudge:
                 free = number not in page.marks and not tenure.committing
                 now_ns = self._observed.world.now_ns  # a client may have gone on in this very step
                 if free and page.freed_ns.get(number, -1) < now_ns:
-                    self._fail("R4 nobody waits for an unused grant", waiter.lock, tenure.lock)
+                    self._fail("R4 no lock waits for an unused grant", waiter.lock, tenure.lock)
 
 
 def _is(state: SlotState, newest: CommittedState) -> bool:
