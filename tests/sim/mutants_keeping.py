@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 from enact_dist.core.client.client import Client
 from enact_dist.core.client.kept import Keeping, KeptGrant, OwnGrants
-from enact_dist.core.client.lock import MultiLock
 from enact_dist.core.client.plan import Phase
 from enact_dist.core.state.commits import Commits
 from enact_dist.core.state.grants import Tenures
@@ -61,23 +60,15 @@ def begins_without_belief(patch: Patch) -> None:
     begin_kept = Client.begin_kept
 
     def wrong(self: Client, lane: int, grant: KeptGrant, *, now_ns: int, hold_ns: int) -> Any:
-        return begin_kept(
-            self, lane, grant, now_ns=min(now_ns, grant.until_ns - 1), hold_ns=hold_ns
-        )
+        until_ns = grant.until_ns
+        grant.until_ns = max(until_ns, now_ns + 1)
+        lock = begin_kept(self, lane, grant, now_ns=now_ns, hold_ns=hold_ns)
+        grant.until_ns = until_ns
+        if lock is not None:
+            lock.parts[0].until_ns = until_ns
+        return lock
 
     patch(Client, "begin_kept", wrong)
-
-
-def ends_without_belief(patch: Patch) -> None:
-    """A client ends a lock without a call though its lease may have ended."""
-
-    def wrong(self: MultiLock, _now_ns: int) -> bool:
-        local = self.phase is Phase.HELD and self.keeping is not None and self.keeping.begun_ns > 0
-        if local:
-            self._end(Phase.COMMITTED)
-        return local
-
-    patch(MultiLock, "finish_kept", wrong)
 
 
 def takes_late_copies(patch: Patch) -> None:
