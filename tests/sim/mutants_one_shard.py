@@ -21,6 +21,7 @@ from enact_dist.core.shard.on_session import SessionDesk
 from enact_dist.core.shard.state import ShardState
 from enact_dist.core.state import grants as tenures
 from enact_dist.core.state import lock_table
+from enact_dist.core.state import tenure as tenure_module
 from enact_dist.core.state.catalogue import Catalogue
 from enact_dist.core.state.clock import Stamps
 from enact_dist.core.state.commits import Commits
@@ -91,12 +92,13 @@ def readers_do_not_block(patch: Patch) -> None:
 
 def patterns_lock_nothing(patch: Patch) -> None:
     """A pattern does not lock its column against newcomers."""
-    wants_of = tenures.wants_of
+    wants_of = tenure_module.wants_of
 
     def wrong(items: Any) -> Any:
         return wants_of([item for item in items if item.access < 4])
 
-    patch(tenures, "wants_of", wrong)
+    for module in (tenures, tenure_module):
+        patch(module, "wants_of", wrong)
 
 
 def blind_acknowledgement(patch: Patch) -> None:
