@@ -119,9 +119,13 @@ class CellClient(SessionClient):
             kept = self._kept.begin(lane, asked) if keep in self.core.kept.by_items else None
             return kept or self._ask(lane, asked)
         except BaseException:
-            self._release_of(lane, begun)
-            if begun:
-                self.release(begun[-1])
+            live = self._release_of(lane)
+            if live is not None and live not in begun:
+                for before in begun[-1:]:
+                    before.lane_free = True  # the lane is that of the lock that was not recorded
+            lock = live or (begun[-1] if begun else None)
+            if lock is not None:
+                self.release(lock)
             else:
                 self._lanes.give_back(lane)
             raise
@@ -156,17 +160,21 @@ class CellClient(SessionClient):
         waited_s = (self._now_ns() - started_ns) / 1e9
         raise not_granted(lock, waited_s, self.carrier.endpoint_of, asked.items)
 
-    def _release_of(self, lane: int, begun: list[MultiLock]) -> None:
+    def _release_of(self, lane: int) -> MultiLock | None:
         """Release the lock of a lane, even one that an interrupt kept from being recorded.
 
         Otherwise keep-alives would name it forever, and a lost release would never be repaired.
+
+        Returns:
+            The lock, whose mark is still to be given back; None if there is none.
         """
+        live = None
         with self._mutex:
             for lock in self.core.live_locks():
                 if lock.lock.lane == lane:
-                    if lock not in begun:
-                        begun.append(lock)
                     lock.release()
+                    live = lock
+        return live
 
     def _begins_anew(self, lock: MultiLock, attempt: int) -> bool:
         """Whether to request a resting lock once more; pauses first."""
