@@ -9,6 +9,8 @@ the test starts: a call never takes the other way unnoticed.  `ENACT_TEST_CARRIE
 
 `deploy/test --carrier both` runs all of them over the one, then over the other.
 
+The same seed draws whether actors ask for their locks in advance or watch (`ENACT_STANDING`).
+
 Marks say what else:
 
     @pytest.mark.carrier("socket", "zenoh")   over both in every run: what matters most
@@ -49,6 +51,17 @@ def drawn(node_id: str, seed: str) -> str:
     """Return the carrier that a run with this seed draws for a test."""
     digest = hashlib.blake2b(f"{seed}:{node_id}".encode(), digest_size=1).digest()
     return BOTH[digest[0] & 1]
+
+
+def rank(node_id: str) -> bytes:
+    """Return where a test stands in the order in which this run takes samples."""
+    return hashlib.blake2b(f"{choice()} of {node_id}".encode(), digest_size=8).digest()
+
+
+def standing(node_id: str) -> str:
+    """Return what `ENACT_STANDING` is for a test: in a quarter of them actors watch their triggers."""
+    digest = hashlib.blake2b(f"{choice()}:{node_id}".encode(), digest_size=2).digest()
+    return "0" if digest[1] < 0x40 else "1"
 
 
 def ways(node) -> tuple[str, ...]:

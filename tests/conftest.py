@@ -1,12 +1,14 @@
 """Rules for all tests: nothing skipped in CI, Ctrl-C as at a terminal, no lock left behind.
 
+Which cases of long tests a run takes (`sampled`).
+
 And over which carrier each of them runs, see `carriers.py` beside this file.
 """
 
 import os
 import signal
 import sys
-from collections import Counter
+from collections import Counter, defaultdict
 from pathlib import Path
 
 import pytest
@@ -39,6 +41,34 @@ def pytest_generate_tests(metafunc):
         metafunc.parametrize("carrier", ways, indirect=True)
 
 
+def pytest_collection_modifyitems(config, items):
+    """Leave out what a run does not take of long tests that are much alike, drawn by its seed.
+
+    `ENACT_TEST_ALL=1` takes all; so does whoever names a case alone.
+    """
+    if os.environ.get("ENACT_TEST_ALL") == "1":
+        return
+    groups = defaultdict(lambda: defaultdict(list))
+    for item in items:
+        mark = item.get_closest_marker("sampled")
+        if mark is not None:
+            of, case = mark.kwargs.get("of", "test"), item.nodeid
+            if of == "test":
+                of = f"{item.path}::{item.originalname}"
+            elif of == "file":
+                of = str(item.path)
+            else:  # some of several files, whole
+                case = item.path.name
+            groups[of, mark.args[0]][case].append(item)
+    left_out = set()
+    for (_, count), cases in groups.items():
+        for case in sorted(cases, key=carriers.rank)[count:]:
+            left_out.update(cases[case])
+    if left_out:
+        config.hook.pytest_deselected(items=[item for item in items if item in left_out])
+        items[:] = [item for item in items if item not in left_out]
+
+
 @pytest.fixture(autouse=True)
 def carrier(request, monkeypatch):
     """How this test and the processes that it starts talk to shards, see `carriers.py`."""
@@ -47,6 +77,7 @@ def carrier(request, monkeypatch):
         monkeypatch.setenv("ENACT_CARRIER", way)
     else:  # what a cell.toml says holds
         monkeypatch.delenv("ENACT_CARRIER", raising=False)
+    monkeypatch.setenv("ENACT_STANDING", carriers.standing(request.node.nodeid))
     request.node.user_properties.append(("carrier", way))
     return way
 

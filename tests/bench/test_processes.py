@@ -169,6 +169,7 @@ def test_set_of_one_frame_is_told_by_heads_and_pixels():
     assert tick_of_set([*whole[:7], forged], areas) is None
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("bench", ["core", "update", "multi", "durable", "fetch", "publish"])
 def test_bench_within_the_process_judges_its_goals_alone(new_run, bench):
     """Whatever a goal is told by is measured by the bench itself."""

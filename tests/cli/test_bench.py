@@ -108,6 +108,7 @@ def test_five_figures_stand_before_the_table(capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.sampled(1, of="file")
 def test_daemons_and_workers_are_started_and_ended(enact, tmp_path, monkeypatch):
     """Benches between processes, over a throw-away cell of two shards; nothing is left behind."""
     monkeypatch.setenv("TMPDIR", str(tmp_path))
@@ -133,6 +134,7 @@ def test_running_cell_is_measured(enact, cell_file):
 
 
 @pytest.mark.slow
+@pytest.mark.sampled(1, of="file")
 def test_payloads_are_fetched_and_published_in_the_process(enact):
     """All sizes, up to 100 MB."""
     rows = rows_of(enact("bench", "fetch", "publish", "--embedded", "--json", *SHORT))
@@ -320,6 +322,7 @@ def test_daemons_of_a_killed_bench_end(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.sampled(1, of="file")
 def test_faults_and_memory_are_rows(enact):
     """A stopped reader, a slot's memory, and deaths; each with its goal."""
     rows = rows_of(enact("bench", "stopped", "memory", "recovery", "--json", *SHORT))

@@ -14,7 +14,7 @@ pytestmark = pytest.mark.slow
 KEPT = Aspect("kept", int, Durability.DURABLE)
 SWIFT = Aspect("swift", int, Durability.OS)
 counter = Entity("counter")
-ROUNDS = int(os.environ.get("ENACT_KILL_ROUNDS", "15"))
+ROUNDS = int(os.environ.get("ENACT_KILL_ROUNDS", "8"))
 
 
 def last_acknowledged(process):

@@ -8,6 +8,7 @@ from run_mutants import run_directed, simulate
 from test_seeds import KNOWN_BAD
 
 
+@pytest.mark.sampled(45)
 @pytest.mark.parametrize("mutant", mutants.SIMULATED, ids=lambda mutant: mutant.__name__)
 def test_mutant_is_caught(mutant):
     """With the shard's own assertions off, the judge notices the edit."""
@@ -19,6 +20,7 @@ def test_mutant_is_caught(mutant):
     assert caught.by, f"survived {caught.seeds} seeds: {mutant.__doc__}"
 
 
+@pytest.mark.sampled(12)
 @pytest.mark.parametrize("mutant", mutants.DIRECTED, ids=lambda mutant: mutant.__name__)
 def test_directed_test_catches_its_mutant(mutant):
     """Where the simulator does not get, a test of `tests/core` fails under the edit."""

@@ -17,6 +17,8 @@ from actors.palletizing.simulation.products import PRODUCTS, product_mesh
 
 from .moves import carton
 
+pytestmark = pytest.mark.sampled(8, of="file")
+
 
 class Belt:
     """The cell's belt with packages that are put where a test wants them; physics stands still."""

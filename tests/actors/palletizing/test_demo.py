@@ -213,6 +213,7 @@ def test_demo_refuses_to_run_without_packages(tmp_path, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.sampled(1, of="file")
 def test_demo_runs_from_training_to_table(tmp_path, capsys):
     """Ten processes train two products and judge three packages; table, lineage and pictures."""
     status = run_demo(out=tmp_path, packages=3)
@@ -234,21 +235,22 @@ def test_demo_runs_from_training_to_table(tmp_path, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.sampled(1, of="file")
 def test_robot_packs_from_training_to_table(tmp_path, capsys):
-    """Sixteen actors train two products and pack four packages in physics; table, why, pictures."""
+    """Sixteen actors train two products and pack two packages in physics; table, why, pictures."""
     pytest.importorskip("mujoco", exc_type=ImportError)
-    status = run_packing(out=tmp_path, packages=4, seed=59, speed=1.5)
+    status = run_packing(out=tmp_path, packages=2, seed=59, speed=1.5)
 
     printed = " ".join(capsys.readouterr().out.split())
-    assert status == 0
+    assert status == 0, printed
     right, placed = re.search(
-        r"(\d) of \d verdicts right; (\d) of 4 packages placed as planned", printed
+        r"(\d) of \d verdicts right; (\d) of 2 packages placed as planned", printed
     ).groups()
-    assert int(placed) >= 2, "one may slip, and none makes its neighbour fail"
+    assert int(placed) >= 1, "one may slip, and none makes its neighbour fail"
     assert int(right) >= int(placed)
     assert "enact why online place/" in printed
     report = json.loads((tmp_path / "report.json").read_text())
-    assert [row["place"] for row in report["packages"]] == [f"place/{n}" for n in range(4)]
+    assert [row["place"] for row in report["packages"]] == [f"place/{n}" for n in range(2)]
     assert all(row["result"] for row in report["packages"])
     assert (tmp_path / "tray_1.png").stat().st_size > 20_000
     assert "system" in (tmp_path / "actors.svg").read_text()

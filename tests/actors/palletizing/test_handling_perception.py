@@ -21,6 +21,8 @@ from actors.palletizing.simulation.physics import PhysicalCell
 from actors.palletizing.training_grasp import TrainingGrasp
 from enact_dist import Entity, Lock, View, ViewEach, Write, testing
 
+pytestmark = pytest.mark.sampled(9, of="file")
+
 NAMES = ("milk_carton", "meal_tray")
 LAYOUT = CellLayout()
 

@@ -21,6 +21,8 @@ from actors.palletizing.simulation.packages import DEMO_PRODUCTS
 from actors.palletizing.simulation.physical_packages import Spread, draw_packages
 from actors.palletizing.simulation.products import product_mesh
 
+pytestmark = pytest.mark.sampled(5, of="file")
+
 MODELS = {name: Surface.free_form(*product_mesh(name)) for name in DEMO_PRODUCTS}
 
 

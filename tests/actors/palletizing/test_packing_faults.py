@@ -40,7 +40,11 @@ if TYPE_CHECKING:
     from actors.palletizing.vocabulary import Request, Result
     from enact_dist import Aspect, Cell, Entity
 
-pytestmark = [pytest.mark.slow, pytest.mark.timing]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.timing,
+    pytest.mark.sampled(1, of="faults of an application"),
+]
 
 T = TypeVar("T")
 LONG_S = 90.0

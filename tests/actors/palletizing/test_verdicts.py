@@ -29,6 +29,8 @@ from actors.palletizing.tray_changes import without
 
 from .tray_pictures import looked_at
 
+pytestmark = pytest.mark.sampled(9, of="file")
+
 SEED = 59
 PRODUCTS = ("milk_carton", "meal_tray")
 

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from enact_dist import Cell
     from enact_dist.world.listings import ActorInfo, LockInfo
 
-pytestmark = pytest.mark.timing
+pytestmark = [pytest.mark.timing, pytest.mark.sampled(1, of="faults of an application")]
 
 T = TypeVar("T")
 
