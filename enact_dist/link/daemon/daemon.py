@@ -253,19 +253,20 @@ def start_shard(settings: DaemonSettings) -> RunningShard:
     return RunningShard(settings)
 
 
-def refuse_second_daemon(settings: DaemonSettings, *, probe_s: float = PROBE_S) -> None:
+def refuse_second_daemon(settings: DaemonSettings, *, probe_s: float | None = None) -> None:
     """Raise if a daemon already serves this shard at one of its endpoints for clients.
 
     Other running shards of the cell are asked where they expect it.
 
     Args:
         settings: Settings of the shard.
-        probe_s: How long a listener there may take to identify itself.
+        probe_s: How long a listener there may take to identify itself; None: `PROBE_S`.
 
     Raises:
         LinkError: A daemon does, or another shard of the cell runs twice.
         ConfigError: An endpoint cannot be read.
     """
+    probe_s = PROBE_S if probe_s is None else probe_s
     name, cell = settings.shard.name, settings.cell
     shards = settings.shard.placement.shards
     expected = {entry.name: entry.endpoints for entry in shards}
