@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from enact_dist.access.reads import slot_of
+from enact_dist.access.session import bind, session_of
 from enact_dist.access.sets import PendingSets
 from enact_dist.actor.actor import (
     Actor,
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
     import threading
     from collections.abc import Mapping
 
+    from enact_dist.core.protocol.datum import Slot
+    from enact_dist.core.protocol.messages import DatumRead
     from enact_dist.terms import Aspect
     from enact_dist.world.cell import Cell
     from enact_dist.world.context import WorldContext
@@ -137,6 +140,7 @@ class BoundActor:
         stop: threading.Event | None = None,
         members: tuple[int, ...] = (),
         tick_ns: int = 0,
+        after: tuple[DatumRead, ...] = (),
     ) -> ActorLock:
         """Return the lock of one update, not yet taken.
 
@@ -147,6 +151,7 @@ class BoundActor:
             stop: Ends the waiting once it is set.
             members: Capture stamps of the set that triggered it, as `Trigger`; nothing without one.
             tick_ns: The tick of a source that it is for; 0 of anything else.
+            after: What the actor has seen, for a lock that waits for news; see `trigger_slots`.
         """
         entity = entity or self.only
         return ActorLock(
@@ -159,7 +164,28 @@ class BoundActor:
             members=members,
             tick_ns=tick_ns,
             triggers=self.declaration.triggers,
+            after=after,
         )
+
+    def trigger_slots(self) -> tuple[Slot, ...]:
+        """Return the slot of each trigger if a lock can wait at its shard for their news; else ().
+
+        It can where the triggers are data of one entity and all data of the lock lie on one shard.
+        """
+        declaration, triggers = self.declaration, self.declaration.triggers
+        if declaration.outcome is not None or declaration.together is not None:
+            return ()
+        if self.only is None and declaration.per_entity:
+            return ()
+        bound = self._bound_for(self.only)
+        requests = tuple(bound.values())
+        each = any(one.access.each for one in triggers)
+        if each or not any(request.access.locks for request in requests):
+            return ()
+        if not session_of(requests).client.stands_alone(bind(requests).items):
+            return ()
+        slots = tuple(slot_of(bound[one]) for one in triggers)
+        return slots if len({slot.entity for slot in slots}) == 1 else ()
 
     def writes(self) -> tuple[str, ...]:
         """Return what the actor may write, as ``world:entities/aspect``."""

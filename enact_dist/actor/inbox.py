@@ -19,18 +19,21 @@ from enact_dist.access.sets import Capture, PendingSets
 from enact_dist.access.together import captured_versions
 from enact_dist.actor.report import ERROR_LENGTH_MAX, Repeated
 from enact_dist.actor.triggers import BackOff, PendingTriggers
+from enact_dist.core.protocol.messages import DatumRead
 from enact_dist.errors import LinkError
 from enact_dist.link.clock import monotonic_ns
 from enact_dist.patterns import pattern_matches
+from enact_dist.terms import Entity
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Hashable, Mapping, Sequence
+    from collections.abc import Collection, Mapping, Sequence
 
     from enact_dist.access.sets import IncompleteSet
     from enact_dist.access.trigger import Trigger
     from enact_dist.access.watch import Change, Watch
     from enact_dist.actor.binding import BoundActor, Watched
-    from enact_dist.terms import Entity, View
+    from enact_dist.core.protocol.datum import Slot
+    from enact_dist.terms import View
 
 log = logging.getLogger("enact.actor")
 
@@ -124,11 +127,30 @@ class Inbox(_Box[PendingTriggers]):
             if news:
                 self._filled.notify_all()
 
-    def used(self, states: Mapping[tuple[int, Entity], Hashable]) -> None:
-        """Note which states the update that has just ended had seen."""
+    def used(
+        self, states: Mapping[tuple[int, Entity], tuple[int, int]], *, standing: bool = False
+    ) -> None:
+        """Note which states the update that has just ended had seen.
+
+        Args:
+            states: Version and stamp of each datum, by trigger and entity.
+            standing: Whether its lock waited for news, so that no watch has counted the versions
+                between.
+        """
         with self._filled:
             for (source, entity), state in states.items():
+                if standing:
+                    self._pending.passed(source, entity, state[0])
                 self._pending.used(source, entity, state)
+
+    def seen(self, slots: Sequence[Slot]) -> tuple[DatumRead, ...]:
+        """Return what an update has seen of each trigger's slot, for `ActorLock.after`."""
+        with self._filled:
+            states = [self._pending.seen(at, Entity(one.entity)) for at, one in enumerate(slots)]
+        return tuple(
+            DatumRead(slot, *(state if isinstance(state, tuple) else (0, 0)))
+            for slot, state in zip(slots, states, strict=True)
+        )
 
 
 class SetInbox(_Box[PendingSets]):

@@ -6,7 +6,7 @@ context instead of a role and the triggering entity instead of a pattern.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Self, TypeVar, cast
 
 from enact_dist.access.lock import Lock
 from enact_dist.access.reads import slot_of
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from enact_dist.access.trigger import Newer
     from enact_dist.actor.outcome import Outcome
     from enact_dist.core.protocol.datum import Datum, Slot
-    from enact_dist.core.protocol.messages import Item
+    from enact_dist.core.protocol.messages import DatumRead, Item
     from enact_dist.terms import Aspect, LockRequestOne
     from enact_dist.wire.payload import Encoded
 
@@ -48,6 +48,7 @@ class ActorLock(Lock):
         members: The capture stamp of each of its data, 0 of those that are missing.
         tick_ns: The tick of `every_s` that it is for, 0 if it is for none.
         triggers: The declared requests that trigger the actor.
+        after: What the actor has seen: the lock waits until one of these slots shows a newer datum.
     """
 
     def __init__(
@@ -62,8 +63,10 @@ class ActorLock(Lock):
         members: Sequence[int] = (),
         tick_ns: int = 0,
         triggers: Sequence[LockRequest[Any]] = (),
+        after: tuple[DatumRead, ...] = (),
     ) -> None:
         super().__init__(*bound.values(), wait_s=wait_s, hold_s=hold_s)
+        self._after = after
         self._interrupt = stop
         self._entity = entity
         self._declared = bound
@@ -73,6 +76,12 @@ class ActorLock(Lock):
         self._triggers = triggers
         stamps = together.stamps(members) if together is not None else {}
         self._in_set: dict[Any, int] = {bound[view]: stamp for view, stamp in stamps.items()}
+
+    def __enter__(self) -> Self:
+        super().__enter__()
+        if self._after and self._lock is not None:  # the time before the news is no waiting
+            self._asked_s = self._granted_s - self._lock.waited_ns / 1e9
+        return self
 
     def _items(self) -> tuple[Item, ...]:
         if not self._in_set:

@@ -22,8 +22,9 @@ from typing import TYPE_CHECKING
 from enact_dist.access.trigger import WHOLE, Trigger
 
 if TYPE_CHECKING:
-    from collections.abc import Hashable
+    from collections.abc import Hashable, Mapping, Sequence
 
+    from enact_dist.core.protocol.messages import DatumRead
     from enact_dist.terms import Entity
 
 
@@ -96,6 +97,16 @@ class PendingTriggers:
         del self._seen[slot]
         self.skipped += self._withdraw(slot)
         return True
+
+    def seen(self, source: int, entity: Entity) -> Hashable | None:
+        """Return the newest state of a trigger datum that was noted; None of one that was not."""
+        return self._seen.get((source, entity.name))
+
+    def passed(self, source: int, entity: Entity, version: int) -> None:
+        """Count the versions between the one that was seen last and the one seen now."""
+        before = self._seen.get((source, entity.name))
+        if isinstance(before, tuple):
+            self.skipped += max(0, version - before[0] - 1)
 
     def used(self, source: int, entity: Entity, state: Hashable) -> None:
         """Take note that an update that just ended has seen this state already.
@@ -208,6 +219,18 @@ class FixedRate:
 def tick_before(wall_ns: int, every_s: float) -> int:
     """Return the newest tick of a source of this period, in ns since 1970."""
     return FixedRate(every_s, now_ns=0, wall_ns=wall_ns).tick(0, wall_ns)
+
+
+def is_news(after: Sequence[DatumRead], seen: Mapping[tuple[int, Entity], tuple[int, int]]) -> bool:
+    """Whether a lock that waited for news shows some.
+
+    It may show none: if the placement changed meanwhile, it did not wait.
+
+    Args:
+        after: What an actor had seen of each of its triggers.
+        seen: Version and stamp of what the lock shows, by trigger and entity.
+    """
+    return any(state != after[index][1:] for (index, _), state in seen.items())
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,8 @@ key, or that is close to one of the others, is a `ConfigError`: a misspelt overr
 a silent default.
 
 `ENACT_CELL` (which cell the command line talks to), `ENACT_SHARED_FOLDER` (where processes of one
-host meet, see `link.memory.shared_folder`) and `ENACT_RETAIN` (whether grants are kept, see
+host meet, see `link.memory.shared_folder`), `ENACT_STANDING` (whether an actor's lock waits for
+news at its shard, see `actor.running.runner`) and `ENACT_RETAIN` (whether grants are kept, see
 `link.memory.use_marks`) are no keys of the file.
 """
 
@@ -38,6 +39,7 @@ _CELL_NAMES: Final = (
     *(f"ENACT_{name}" for name in variables_of(CellConfig)),
     "ENACT_SHARED_FOLDER",
     "ENACT_RETAIN",
+    "ENACT_STANDING",
 )
 _SHARD_PREFIX: Final = "ENACT_SHARD_"
 _CLOSE: Final = 0.85
@@ -61,7 +63,7 @@ def with_environment(config: CellConfig, environment: Mapping[str, str]) -> Cell
 
 def without_overrides(environment: Mapping[str, str]) -> dict[str, str]:
     """Return `environment` without overrides, for processes that follow their `cell.toml`."""
-    overrides = set(_CELL_NAMES) - {"ENACT_SHARED_FOLDER", "ENACT_RETAIN"}
+    overrides = set(_CELL_NAMES) - {"ENACT_SHARED_FOLDER", "ENACT_RETAIN", "ENACT_STANDING"}
     return {
         name: text
         for name, text in environment.items()

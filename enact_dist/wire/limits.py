@@ -11,7 +11,7 @@ from typing import Final
 
 from enact_dist.terms import NAME_LENGTH_MAX
 
-FRAME_VERSION: Final = 8
+FRAME_VERSION: Final = 9
 """Version of the frames; both ends must speak the same.  2: commits over shards; 3: a WELCOME
 names shared memory; 5: a datum may name a payload in place of its bytes; 7: an identity stands in
 the key of each request and token, and where a socket is opened; an aspect names the types that its

@@ -314,6 +314,32 @@ def _kept_order() -> list[Variant]:
     ]
 
 
+def _standing_locks() -> list[Variant]:
+    model = "standing_locks"
+    mutants = [
+        ("TAKES_COPY", "a late copy of an ended lock enters the queue again", 1),
+        ("ALWAYS", "granted without news", 2),
+        ("NO_LOOK", "the shard compares at changes only, not when a request comes", 12),
+        ("NO_FIRE", "a change does not look at what is parked", 12),
+        ("ASKS_ONCE", "the client does not ask again", 12),
+        ("FORGETS_NEWS", "what a lost update was for counts as seen", 12),
+    ]
+    goals = [
+        (1, "a change lets a parked lock enter the queue"),
+        (2, "a request comes with news already there"),
+        (3, "a slice of waiting ends without news"),
+        (4, "a lost grant is asked for again"),
+        (5, "a commit is fenced"),
+        (6, "a late copy of an ended lock is refused"),
+    ]
+    return [
+        Variant(model, "1 actor, 3 changes, 2 losses", HOLDS),
+        Variant(model, "the same, 4 changes, 3 losses", HOLDS, ("FIRES=4", "LOSSES=3")),
+        *(Variant(model, text, BREAKS, (macro,), rule) for macro, text, rule in mutants),
+        *(Variant(model, text, REACHES, (f"GOAL={goal}",), goal) for goal, text in goals),
+    ]
+
+
 VARIANTS = (
     *_commits(),
     *_grace(),
@@ -321,6 +347,7 @@ VARIANTS = (
     *_expected_views(),
     *_kept_grants(),
     *_kept_order(),
+    *_standing_locks(),
 )
 MODELS = tuple(dict.fromkeys(variant.model for variant in VARIANTS))
 

@@ -19,6 +19,7 @@ import mutants_one_shard as one
 import mutants_over_shards as over
 import mutants_payloads as payloads
 import mutants_readers as readers
+import mutants_standing as standing
 import mutants_worlds as worlds
 from mutants_directed import DIRECTED
 
@@ -46,6 +47,7 @@ SIMULATED = (
     *_of(history),
     *_of(growth),
     *_of(keeping),
+    *_of(standing),
 )
 """Those that the simulator catches."""
 ALL = (*SIMULATED, *DIRECTED)

@@ -28,6 +28,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import math
+import os
 import random
 import threading
 from collections.abc import Callable, Mapping
@@ -48,7 +49,7 @@ from enact_dist.actor.report import (
 )
 from enact_dist.actor.running.doing import Doing
 from enact_dist.actor.running.load import shown_values
-from enact_dist.actor.triggers import BackOff, FixedRate
+from enact_dist.actor.triggers import BackOff, FixedRate, is_news
 from enact_dist.errors import (
     LeaseLostError,
     LinkError,
@@ -57,10 +58,11 @@ from enact_dist.errors import (
     PermissionDeniedError,
 )
 from enact_dist.link.clock import monotonic_ns, wall_ns
+from enact_dist.terms import Entity
 
 if TYPE_CHECKING:
     from enact_dist.actor.lock import ActorLock
-    from enact_dist.terms import Entity
+    from enact_dist.core.protocol.messages import DatumRead
     from enact_dist.world.cell import Cell
 
 OnError = Callable[["Entity | None", Exception], None]
@@ -69,6 +71,8 @@ OnError = Callable[["Entity | None", Exception], None]
 STOP_LOOK_S: Final = 0.1
 """How often an idle actor checks `stop`: no call waits for an `Event` and a `Condition` at once."""
 
+STANDING_VARIABLE: Final = "ENACT_STANDING"
+"""0 in the environment of an actor lets it watch its triggers even where its lock could wait."""
 REPORT_EVERY_NS: Final = 1_000_000_000
 SWEEP_NS: Final = 2_000_000_000
 """How often an actor with `once` looks for versions that an earlier process left as taken."""
@@ -164,6 +168,7 @@ class ActorRun:
         self._warned = False
         self.words_in = min(context.name for context in self._bound.contexts.values())
         self._listens, self._word = False, ""
+        self._standing = False
         self._reported_ns = 0
         if self._every_s is not None:
             check_period(self.name, self._every_s)
@@ -217,6 +222,8 @@ class ActorRun:
             self._record.state = "running"
             self._report(now=True)
             if self._bound.declaration.triggers:
+                if os.environ.get(STANDING_VARIABLE) != "0":
+                    self._run_standing()
                 self._run_triggered()
             elif self._every_s is not None:
                 self._run_source(self._every_s)
@@ -236,10 +243,11 @@ class ActorRun:
         return self.statistics()
 
     def _look_out(self) -> None:
-        """Report on behalf of an update that takes long."""
+        """Report on behalf of an update, or of a wait for news, that takes long."""
         while not self._ended.wait(LOOK_OUT_S):
             call = self.doing.call
-            if call is not None and monotonic_ns() - call.since_ns >= REPORT_EVERY_NS:
+            long_update = call is not None and monotonic_ns() - call.since_ns >= REPORT_EVERY_NS
+            if long_update or self._standing:
                 self._report()
 
     def _reaches(self, ask: Callable[[], object]) -> bool:
@@ -258,6 +266,22 @@ class ActorRun:
             else:
                 return True
         return False
+
+    def _run_standing(self) -> None:
+        """Ask for each lock ahead: its shard grants it, data included, once a trigger has changed.
+
+        Returns when the actor is stopped, or its triggers have to be watched.
+        """
+        refused = 0
+        while not self._stop.is_set() and (slots := self._bound.trigger_slots()):
+            entity = Entity(slots[0].entity)
+            ending = self._attempt(entity, after=self._inbox.seen(slots))
+            if isinstance(ending, REFUSALS):
+                self._stop.wait(self._pause_s(refused))
+                refused += 1
+            else:
+                refused = 0
+            self._report()
 
     def _run_triggered(self) -> None:
         """Run for what changes; of sets first for the newest existing one, then as they come."""
@@ -313,7 +337,12 @@ class ActorRun:
             refused += 1
 
     def _attempt(
-        self, entity: Entity | None, *, members: tuple[int, ...] = (), tick_ns: int = 0
+        self,
+        entity: Entity | None,
+        *,
+        members: tuple[int, ...] = (),
+        tick_ns: int = 0,
+        after: tuple[DatumRead, ...] = (),
     ) -> Exception | None:
         """Run `update` once under its lock; return what ended it early."""
         asked_ns, granted_ns = monotonic_ns(), 0
@@ -326,13 +355,18 @@ class ActorRun:
                 stop=self._stop,
                 members=members,
                 tick_ns=tick_ns,
+                after=after,
             )
+            self._standing = bool(after)
             with lock:
+                self._standing = False
                 granted_ns = monotonic_ns()
+                asked_ns = granted_ns - round(lock.statistics().waited_s * 1e9)
                 absent = lock.absent()
                 missing = [] if self._sets is None or self._sets.sets.enough(absent) else absent
                 seen = self._seen(lock)
-                if not missing:
+                stale = bool(after) and not is_news(after, seen)
+                if not missing and not stale:
                     self._warn_of_repetition(entity)
                     about = _about(entity)
                     with self.doing.inside("update", about=about, lock=lock, remains=NOTHING):
@@ -355,13 +389,15 @@ class ActorRun:
             ended_ns = monotonic_ns()
             if missing and self._sets is not None:
                 self._sets.gone(min(filter(None, members)), missing)
-            else:
+            elif not stale:
                 took_ns = ended_ns - granted_ns
                 self._record.updated(took_ns=took_ns, now_ns=ended_ns, wall_ns=wall_ns())
             ending = None
-        self._record.waited((granted_ns or monotonic_ns()) - asked_ns)
+        self._standing = False
+        if granted_ns or not after:
+            self._record.waited((granted_ns or monotonic_ns()) - asked_ns)
         if not isinstance(ending, REFUSALS):
-            self._inbox.used(seen)
+            self._inbox.used(seen, standing=bool(after))
         if ending is not None and self._on_error is not None:
             self._on_error(entity, ending)
         return ending

@@ -31,6 +31,7 @@ from enact_dist.core.client.kept import Keeping
 from enact_dist.core.client.plan import OF_SESSIONS, Part, Phase, Plan, Reading, first_asking
 from enact_dist.core.protocol.checks import NO_PAYLOAD
 from enact_dist.core.protocol.messages import (
+    NO_PLACE,
     OUTCOME_COMMITTED,
     Answer,
     Changed,
@@ -101,6 +102,9 @@ class MultiLock:
     cut: Cut | None = None
     unnamed: bool = False  # its bytes travel: the shard has lost the payloads that it named
     keeping: Keeping | None = None  # if its grant may stay with the session
+    after: tuple[DatumRead, ...] = ()  # it enters the queue once there is newer than these
+    patience_ns: int = 0  # how long it may then stay there
+    waited_ns: int = 0  # in the queue of the last shard
     _finishing: Finishing | None = None
     _free_calls: int = FREE_CALLS
     _retry_at_ns: int = 0
@@ -127,8 +131,7 @@ class MultiLock:
             return [], 0
         if now_ns < self._retry_at_ns:
             return [], min(self._retry_at_ns, self.give_up_ns)
-        acquires = self.phase is Phase.ACQUIRING
-        calls = [self._acquire(now_ns)] if acquires else self._calls(now_ns)
+        calls = [self._acquire(now_ns)] if self.phase is Phase.ACQUIRING else self._calls(now_ns)
         if not self.client.greeted.issuperset(dict(calls)):
             strangers = [shard for shard in dict(calls) if self.client.needs_hello(shard)]
             return [(shard, self.client.hello(shard)) for shard in strangers], 0
@@ -154,9 +157,9 @@ class MultiLock:
         left_ns = max(0, self.give_up_ns - now_ns)
         # The hold limit counts from the last grant; earlier ones must outlast the waiting too.
         hold_ns = self.hold_ns if part is parts[-1] else self.hold_ns + left_ns
-        wait_ns = min(self.slice_ns, left_ns)
+        wait_ns = self.slice_ns if self.after else min(self.slice_ns, left_ns)
         return part.shard, self.client.acquire(
-            self.lock, self.plan, part, now_ns=now_ns, wait_ns=wait_ns, hold_ns=hold_ns
+            self.lock, self.plan, part, self.after, now_ns=now_ns, wait_ns=wait_ns, hold_ns=hold_ns
         )
 
     def take_farewells(self) -> list[tuple[str, Request]]:
@@ -212,10 +215,7 @@ class MultiLock:
             self._epoch_changed(shard, request)
 
     def _undecided(self, request: Request, answer: Refused) -> bool:
-        """Whether a refusal leaves open what became of a commit that was sent.
-
-        A busy shard has not looked at this copy; an earlier one may have been applied.
-        """
+        """Whether a refusal leaves a commit open: a busy shard has not looked at it."""
         if self.phase is not Phase.COMMITTING or not self.sent_commit:
             return False
         return not isinstance(request, Commit) or answer.code == OVERLOAD
@@ -256,6 +256,7 @@ class MultiLock:
             if epoch != client.peers[shard].epoch:
                 return  # a grant of an epoch that is over
             part.granted(answer, client.sendings, ttl_ns=client.ttl_ns)
+            self.waited_ns = answer.waited_ns
             client.saw_stamp(answer.stamp_ns)
             self.states += map(Reading, repeat(shard), repeat(epoch), answer.states)
             if self.cut is not None:
@@ -267,7 +268,9 @@ class MultiLock:
         elif isinstance(answer, Waiting):
             self.blockers = answer.blockers
             self._free_calls = 0
-            if now_ns >= self.give_up_ns:
+            if self.after and answer.place == NO_PLACE:
+                self.give_up_ns, self._free_calls = now_ns + self.patience_ns, FREE_CALLS
+            elif now_ns >= self.give_up_ns:
                 self._gives_up()
         elif isinstance(answer, Stale):
             self.lose("its place in the queue was lost")

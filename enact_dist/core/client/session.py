@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
     from enact_dist.core.client.plan import Part, Plan
     from enact_dist.core.protocol.datum import LockId
-    from enact_dist.core.protocol.messages import Prepared, Request
+    from enact_dist.core.protocol.messages import DatumRead, Prepared, Request
 
 
 class HeldThere(Protocol):
@@ -279,9 +279,17 @@ class ClientSession(Generic[L]):
     # ---------------------------------------------------------------- locks
 
     def acquire(
-        self, lock: LockId, plan: Plan, part: Part, *, now_ns: int, wait_ns: int, hold_ns: int
+        self,
+        lock: LockId,
+        plan: Plan,
+        part: Part,
+        after: tuple[DatumRead, ...] = (),
+        *,
+        now_ns: int,
+        wait_ns: int,
+        hold_ns: int,
     ) -> Acquire:
-        """Return the next request for one part of a lock."""
+        """Return the next request for one part of a lock, which waits for news after this."""
         peer = self.peer(part.shard)
         return Acquire(
             lock,
@@ -294,6 +302,7 @@ class ClientSession(Generic[L]):
             self.seen_stamp_ns,
             len(plan.locks) == 1 and not plan.views,
             peer.successions,
+            after,
         )
 
     def ended(self, lock: L) -> None:

@@ -58,6 +58,7 @@ class Granted:
     `count_seen` is the highest message counter that had arrived from the session; `hold_left_ns`
     counts from the sending of this answer.  `stamp_ns` is the shard's hybrid logical time,
     `from_ns` the largest timestamp in `states`: views at other shards must not be older.
+    `waited_ns` is how long the lock stood in the queue.
     """
 
     lock: LockId
@@ -68,11 +69,15 @@ class Granted:
     stamp_ns: int
     states: tuple[SlotState, ...]
     from_ns: int = 0
+    waited_ns: int = 0
 
 
 @message
 class Waiting:
-    """Not yet granted; ask again.  `place` counts from 1, `blockers` are the locks ahead."""
+    """Not yet granted; ask again.  `place` counts from 1, `blockers` are the locks ahead.
+
+    The place is 0 while no datum has changed that the lock waits for (`Acquire.seen`).
+    """
 
     lock: LockId
     epoch: int

@@ -74,6 +74,7 @@ from enact_dist.core.protocol.parts import (
     CAUSE_COMMIT,
     CAUSE_FORK,
     NO_LIMIT,
+    NO_PLACE,
     NOT_KEPT,
     PLACES,
     PROVE,

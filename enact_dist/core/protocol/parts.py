@@ -189,6 +189,8 @@ class GrantLeft(NamedTuple):
     hold_left_ns: int
 
 
+NO_PLACE: Final = 0
+"""The place of a lock that waits for news and has not entered the queue."""
 NOT_KEPT: Final = 0
 """Of a grant that is over."""
 PROVE: Final = 1

@@ -59,6 +59,8 @@ class Acquire:
     lock, its views included, lies on this shard, so that its commit decides in one step.
     `successions` says how many successions of datum types the client knows of at this shard: if it
     has missed one of an aspect that it would write, the shard refuses it with ``newer_type``.
+    `seen` are data that the client has seen: while none of these slots shows a newer datum, the
+    lock gets no place in the queue, and the answer after `wait_ns` is `Waiting` with the place 0.
     """
 
     lock: LockId
@@ -71,6 +73,7 @@ class Acquire:
     seen_stamp_ns: int
     alone: bool = False
     successions: int = 0
+    seen: tuple[DatumRead, ...] = ()
 
 
 @message

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import heapq
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.checks import unknown_world, wrong_access
 from enact_dist.core.protocol.datum import Column, Datum, LockId
 from enact_dist.core.protocol.messages import (
+    NO_PLACE,
     Acquire,
     Answer,
     EpochChanged,
@@ -17,10 +20,12 @@ from enact_dist.core.protocol.messages import (
     Released,
     Slice,
     Stale,
+    Waiting,
     WrongShard,
 )
 from enact_dist.core.protocol.records import Effect, Reply
 from enact_dist.core.shard import owners
+from enact_dist.core.state.grants import STALE_ENDS_MAX, WAIT_SLICE_NS_MAX
 from enact_dist.core.state.sessions import LANES_MAX, Lane, SessionState
 from enact_dist.core.state.tenure import Shape, shape_of
 from enact_dist.terms import ACCESSES
@@ -28,9 +33,11 @@ from enact_dist.terms import ACCESSES
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
+    from enact_dist.core.protocol.datum import Slot
     from enact_dist.core.protocol.messages import Item
     from enact_dist.core.shard.on_prepare import PrepareDesk
     from enact_dist.core.shard.state import ShardState
+    from enact_dist.core.state.tenure import Tenure
 
 ITEMS_MAX: Final = 4096
 """Requests in one lock or view."""
@@ -44,12 +51,118 @@ DAMAGED: Final = "damaged"
 """The code of a refusal because the stored bytes of a datum are not what was stored."""
 
 
+@dataclass(frozen=True, slots=True)
+class _Standing:
+    """The request of a lock that waits for news, and until when it may be parked."""
+
+    message: Acquire
+    reply_to: int
+    until_ns: int
+
+
+class StandingLocks:
+    """Locks that wait for newer data than their client has seen, outside the queue.
+
+    Such a lock is its parked request and nothing else: when its slice of waiting ends, or word is
+    lost, the client asks again, and the shard compares anew.  So nothing here survives, is repaired
+    or is given back.
+
+    Rule a change must keep
+      * The shard compares when a request comes, and at each change: news between two requests of a
+        client are found by the next one.
+
+    Attributes:
+        by_lane: The parked requests, by session and lane.
+    """
+
+    def __init__(self) -> None:
+        self.by_lane: dict[tuple[str, int], _Standing] = {}
+        self._by_slot: dict[Slot, dict[tuple[str, int], None]] = {}
+        self._ends: list[tuple[int, int, tuple[str, int]]] = []
+
+    def park(self, message: Acquire, *, reply_to: int, now_ns: int) -> Iterator[Effect]:
+        """Keep a request until there is news or its slice ends; the older one of its lane ends."""
+        lane = message.lock.session, message.lock.lane
+        yield from self._end(lane)
+        wait_ns = max(0, min(message.wait_ns, WAIT_SLICE_NS_MAX))
+        standing = self.by_lane[lane] = _Standing(message, reply_to, now_ns + wait_ns)
+        for seen in message.seen:
+            self._by_slot.setdefault(seen.slot, {})[lane] = None
+        if not wait_ns:
+            yield from self._end(lane)
+            return
+        if len(self._ends) > 2 * len(self.by_lane) + STALE_ENDS_MAX:
+            self._ends = [(one.until_ns, one.reply_to, lane) for lane, one in self.by_lane.items()]
+            heapq.heapify(self._ends)
+        heapq.heappush(self._ends, (standing.until_ns, reply_to, lane))
+
+    def take(self, slots: Iterable[Slot]) -> list[_Standing]:
+        """Return what waits for news of these slots, longest first, and forget it."""
+        lanes = dict.fromkeys(lane for slot in slots for lane in self._by_slot.get(slot, ()))
+        return [self._forget(lane) for lane in lanes]
+
+    def drop(self, lock: LockId) -> Iterator[Effect]:
+        """End the waiting of a lock that its client gives up."""
+        lane = lock.session, lock.lane
+        found = self.by_lane.get(lane)
+        if found is not None and found.message.lock == lock:
+            yield from self._end(lane)
+
+    def end_slices(self, now_ns: int) -> Iterator[Effect]:
+        """Answer the requests whose slice of waiting is over."""
+        while self._ends and self._ends[0][0] <= now_ns:
+            _, reply_to, lane = heapq.heappop(self._ends)
+            found = self.by_lane.get(lane)
+            if found is not None and found.reply_to == reply_to:
+                yield from self._end(lane)
+
+    def end_all(self) -> Iterator[Effect]:
+        """Answer all: the shard is about to stop."""
+        for lane in list(self.by_lane):
+            yield from self._end(lane)
+
+    def assert_invariants(self) -> None:
+        """Assert the bookkeeping.  For tests and simulation."""
+        by_slot: dict[Slot, set[tuple[str, int]]] = {}
+        for lane, standing in self.by_lane.items():
+            for seen in standing.message.seen:
+                by_slot.setdefault(seen.slot, set()).add(lane)
+        assert by_slot == {slot: {*lanes} for slot, lanes in self._by_slot.items()}
+        ends = {(reply_to, lane) for _, reply_to, lane in self._ends}
+        assert ends >= {(one.reply_to, lane) for lane, one in self.by_lane.items()}
+
+    def next_deadline_ns(self) -> int | None:
+        """Return when the next slice ends."""
+        return self._ends[0][0] if self._ends else None
+
+    def _end(self, lane: tuple[str, int]) -> Iterator[Effect]:
+        if lane in self.by_lane:
+            found = self._forget(lane)
+            lock, epoch = found.message.lock, found.message.epoch
+            yield Reply(found.reply_to, Waiting(lock, epoch, NO_PLACE, ()))
+
+    def _forget(self, lane: tuple[str, int]) -> _Standing:
+        found = self.by_lane.pop(lane)
+        for seen in found.message.seen:
+            waiting = self._by_slot.get(seen.slot)
+            if waiting is not None:
+                waiting.pop(lane, None)
+                if not waiting:
+                    del self._by_slot[seen.slot]
+        return found
+
+
 class LockDesk:
-    """Everything about who gets which lock, and the data that come with it."""
+    """Everything about who gets which lock, and the data that come with it.
+
+    Attributes:
+        standing: The locks that wait for newer data before they enter the queue.
+    """
 
     def __init__(self, state: ShardState, prepares: PrepareDesk) -> None:
         self._state = state
         self._prepares = prepares
+        self.standing = StandingLocks()
 
     def on_acquire(self, message: Acquire, reply_to: int) -> Iterable[Effect]:
         """Queue a lock, or continue with one that is already queued or granted."""
@@ -74,25 +187,79 @@ class LockDesk:
                 return refused
             if lock.session in tenures.by_session or state.pins.by_session:
                 effects += self._supersede(lock)
-            session.lanes[lock.lane].top = lock.seq
-            if shape is None:
-                shape = tenures.shapes.get(items) or shape_of(items)
-            tenure = tenures.enqueue(
-                message, shape, session, now_ns=state.now_ns, at_once=state.grants
-            )
-            if tenure.token is None and tenures.kept.by_number:
-                tenures.recall_for(tenure, now_ns=state.now_ns)
-            if tenures.table.ready:
-                effects += state.grant_ready()
+            if message.seen and not self._has_news(message):
+                effects += self.standing.park(message, reply_to=reply_to, now_ns=state.now_ns)
+                return effects
+            tenure = self._enqueue(message, session, shape, effects)
+        self._grant_or_park(tenure, message, reply_to, message.wait_ns, effects)
+        return effects
+
+    def _enqueue(
+        self, message: Acquire, session: SessionState, shape: Shape | None, effects: list[Effect]
+    ) -> Tenure:
+        """Give a lock its place in the queue; whom that lets go on is added to `effects`."""
+        state, tenures, lock = self._state, self._state.tenures, message.lock
+        session.lanes[lock.lane].top = lock.seq
+        if shape is None:
+            shape = tenures.shapes.get(message.items) or shape_of(message.items)
+        tenure = tenures.enqueue(message, shape, session, now_ns=state.now_ns, at_once=state.grants)
+        if tenure.token is None and tenures.kept.by_number:
+            tenures.recall_for(tenure, now_ns=state.now_ns)
+        if tenures.table.ready:
+            effects += state.grant_ready()
+        return tenure
+
+    def _grant_or_park(
+        self, tenure: Tenure, message: Acquire, reply_to: int, wait_ns: int, effects: list[Effect]
+    ) -> None:
+        """Answer a request with the grant, or keep it until there is one."""
+        state, tenures = self._state, self._state.tenures
         if tenure.token is not None:
             stamp_ns = state.stamps.now(wall_ns=state.wall_ns, seen_ns=message.seen_stamp_ns)
             granted = tenures.granted(tenure, now_ns=state.now_ns, stamp_ns=stamp_ns)
             effects += (Reply(reply_to, granted),)
         else:
             state.count("lock_waits")
-            effects += tenures.park(
-                tenure, reply_to=reply_to, wait_ns=message.wait_ns, now_ns=state.now_ns
-            )
+            effects += tenures.park(tenure, reply_to=reply_to, wait_ns=wait_ns, now_ns=state.now_ns)
+
+    # ---------------------------------------------------------------- locks that wait for news
+
+    def _has_news(self, message: Acquire) -> bool:
+        """Whether a slot shows a datum that is not the one which the client has seen."""
+        slots = self._state.slots
+        for slot, version, stamp_ns in message.seen:
+            newest = slots[slot]
+            known = (newest.version, newest.stamp_ns) == (version, stamp_ns)
+            if newest.datum is not None and not known:
+                return True
+        return False
+
+    def begin_standing(self, changed: Iterable[Slot]) -> list[Effect]:
+        """Let the locks that wait for news of these slots enter the queue."""
+        state, effects = self._state, list[Effect]()
+        for waiting in self.standing.take(changed):
+            message, reply_to = waiting.message, waiting.reply_to
+            session = state.sessions.by_id.get(message.lock.session)
+            left_ns = max(0, waiting.until_ns - state.now_ns)
+            if session is None or not session.present:
+                effects += (Reply(reply_to, state.epoch_changed(message.epoch)),)
+                continue
+            if not self._has_news(message):
+                again = replace(message, wait_ns=left_ns)
+                effects += self.standing.park(again, reply_to=reply_to, now_ns=state.now_ns)
+                continue
+            shape = state.tenures.shapes.get(message.items)
+            refusal = self.refused(message.map_version, message.items, shape)
+            if refusal is not None:
+                effects += (Reply(reply_to, refusal),)
+                continue
+            kept_out = self._kept_out(message, session, reply_to)
+            if kept_out is not None:
+                effects += kept_out
+                continue
+            state.count("standing_locks_begun")
+            tenure = self._enqueue(message, session, shape, effects)
+            self._grant_or_park(tenure, message, reply_to, left_ns, effects)
         return effects
 
     def _kept_out(
@@ -256,6 +423,8 @@ class LockDesk:
                 lane.top = max(lane.top, lock.seq)  # a late copy of its commit is fenced
         if lock.session in state.pins.by_session:
             state.pins.drop(lock)
+        if self.standing.by_lane:
+            effects += self.standing.drop(lock)
         effects += (Reply(reply_to, Released()),)
         return effects
 

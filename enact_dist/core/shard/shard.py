@@ -14,7 +14,7 @@ ours.  Its rule *one lock per thread* is the lane: a newer seq ends the older on
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, cast
 
 from enact_dist.core.protocol.checks import wrong_patterns
 from enact_dist.core.protocol.messages import (
@@ -61,6 +61,7 @@ from enact_dist.core.protocol.records import (
     Effect,
     MakeRoom,
     Persisted,
+    Publish,
     Record,
     Recovered,
     Reply,
@@ -86,7 +87,7 @@ from enact_dist.terms import Durability
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-    from enact_dist.core.protocol.messages import Request
+    from enact_dist.core.protocol.messages import Notice, Request
     from enact_dist.core.protocol.records import Event
 
 _DECIDE: Final = frozenset((Persisted, Called, Drain))
@@ -221,6 +222,15 @@ class Shard:
             decided = not state.stored or type(message) in _DECIDE
             effects += self._views.answer_parked(decided=decided)
             effects += self._worlds.answer_waiting(decided=decided)
+        if self._locks.standing.by_lane:
+            changed = [
+                change.slot
+                for effect in effects
+                if type(effect) is Publish
+                for change in cast("Notice", effect.notice).changes
+            ]
+            if changed:
+                effects += self._locks.begin_standing(changed)
         if state.tenures.table.ready:
             effects += state.grant_ready()
         return effects
@@ -254,7 +264,9 @@ class Shard:
             )
             if soonest is not None
         ]
-        for desk in (self._prepares, self._stamps, self._views, self._worlds, state.decisions):
+        standing = self._locks.standing
+        desks = self._prepares, self._stamps, self._views, self._worlds, state.decisions, standing
+        for desk in desks:
             due_ns = desk.next_deadline_ns()
             if due_ns is not None:
                 deadlines.append(due_ns)
@@ -326,6 +338,7 @@ class Shard:
             yield from self._sessions.end(idle.session, "its session stayed away")
         yield from self.state.grant_ready()
         yield from self.state.tenures.end_slices(now_ns)
+        yield from self._locks.standing.end_slices(now_ns)
         yield from self._stamps.answer_reached()
         yield from self._prepares.ask()
         yield from self.state.decisions.tell(now_ns)
@@ -357,6 +370,7 @@ class Shard:
         for tenure in list(self.state.tenures.by_lock.values()):
             if tenure.parked is not None:
                 yield self.state.tenures.waiting(tenure, self.state.now_ns)
+        yield from self._locks.standing.end_all()
         yield from self._stamps.answer_all()
 
     # ---------------------------------------------------------------- people
@@ -419,6 +433,7 @@ class Shard:
         """Assert I1, I8, I10, I11 and the bookkeeping of all parts.  For tests and simulation."""
         self._prepares.assert_invariants()
         self.state.tenures.assert_invariants()
+        self._locks.standing.assert_invariants()
         self._worlds.assert_invariants()
         self.state.slots.assert_invariants()
         if self.state.sessions.in_grace(self.state.now_ns):

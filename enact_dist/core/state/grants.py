@@ -285,6 +285,7 @@ class Tenures:
             stamp_ns,
             tuple(states),
             from_ns,
+            tenure.granted_ns - tenure.asked_ns,
         )
 
     def find(self, lock: LockId, token: Token) -> Tenure | None:

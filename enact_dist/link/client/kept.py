@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from enact_dist.core.client.client import Client
     from enact_dist.core.client.lock import MultiLock
-    from enact_dist.core.protocol.messages import Item
+    from enact_dist.core.protocol.messages import DatumRead, Item
     from enact_dist.link.memory.payload_client import SharedPayloads
 
 
@@ -36,6 +36,7 @@ class WantedLock(NamedTuple):
     keep: tuple[Item, ...]
     interrupt: threading.Event | None
     begun: list[MultiLock]
+    after: tuple[DatumRead, ...] = ()
 
 
 class KeptUses:

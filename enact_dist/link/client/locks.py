@@ -80,6 +80,7 @@ class CellClient(SessionClient):
         begun: list[MultiLock] | None = None,
         past_ns: int = 0,
         keep: tuple[Item, ...] = (),
+        after: tuple[DatumRead, ...] = (),
     ) -> MultiLock:
         """Acquire a lock; it rests in HELD when this returns.
 
@@ -93,6 +94,8 @@ class CellClient(SessionClient):
             past_ns: All items are views, as of this timestamp.
             keep: The requests under which this session may keep the grant for the next lock of
                 them; empty: it may not.
+            after: Data that were seen: the lock enters the queue once one of their slots shows a
+                newer datum, and `wait_s` counts from then on.  Only if `stands_alone(items)`.
 
         Raises:
             LockTimeoutError: Not granted in time; nothing is held.
@@ -107,7 +110,7 @@ class CellClient(SessionClient):
         started_ns = self._now_ns()
         give_up_ns = started_ns + int(min(wait_s, CALLS_S_MAX) * 1e9)
         asked = WantedLock(
-            tuple(items), give_up_ns, int(hold_s * 1e9), past_ns, keep, interrupt, begun
+            tuple(items), give_up_ns, int(hold_s * 1e9), past_ns, keep, interrupt, begun, after
         )
         if started_ns >= self.renewal.used_until_ns:
             self.renewal.used()
@@ -134,12 +137,16 @@ class CellClient(SessionClient):
         """Ask for a lock, as often as it takes, until it is held or cannot be."""
         core, begun, interrupt = self.core, asked.begun, asked.interrupt
         lock_views, started_ns = False, self._now_ns()
+        patience_ns = max(0, asked.give_up_ns - started_ns)
         for attempt in itertools.count():
             with self._mutex:
                 plan = core.plan(asked.items, lock_views=lock_views, past_ns=asked.past_ns)
                 now_ns = self._now_ns()
                 wait_ns, hold_ns = max(0, asked.give_up_ns - now_ns), asked.hold_ns
+                wait_ns = patience_ns if asked.after else wait_ns
                 lock = core.begin(lane, plan, now_ns=now_ns, wait_ns=wait_ns, hold_ns=hold_ns)
+                if asked.after and len(plan.locks) == 1 and not plan.views:
+                    lock.after, lock.patience_ns = asked.after, patience_ns
                 begun.append(lock)
                 keeps = asked.keep and plan.keepable and not lock_views
                 if keeps and self.payloads.keeps(plan.locks[0][0]):
@@ -159,6 +166,12 @@ class CellClient(SessionClient):
                 self.count("views_locked")
         waited_s = (self._now_ns() - started_ns) / 1e9
         raise not_granted(lock, waited_s, self.carrier.endpoint_of, asked.items)
+
+    def stands_alone(self, items: tuple[Item, ...]) -> bool:
+        """Whether a lock of these lies on one shard, so that it can wait there for news."""
+        with self._mutex:
+            plan = self.core.plan(items)
+        return len(plan.locks) == 1 and not plan.views
 
     def _release_of(self, lane: int) -> MultiLock | None:
         """Release the lock of a lane, even one that an interrupt kept from being recorded.

@@ -30,6 +30,7 @@ from enact_dist.verify.simulation.judges.model import Model
 from enact_dist.verify.simulation.schedule import WHOLE, Happening, PartOfRun, Schedule
 from enact_dist.verify.simulation.work.forks import Forker
 from enact_dist.verify.simulation.work.historian import Historian
+from enact_dist.verify.simulation.work.standing import StandingActors
 from enact_dist.verify.simulation.work.workload import ASPECTS, Workload
 
 if TYPE_CHECKING:
@@ -101,6 +102,7 @@ class Scenario:
         self._steps = self.schedule.place("steps")
         self.forker = Forker(world, self.model, self.workload)
         self.historian = Historian(world, self.history, self.model, self.workload)
+        self.standing = StandingActors(world, self.model, self.workload)
         self.injector = Injector(
             world, cell, self.network, self.shards, until_ns=self._faults_end_ns
         )
@@ -152,6 +154,8 @@ class Scenario:
                 host.start(self.forker.thread(host, self.cell.lanes))
             if self.historian.takes_place:
                 host.start(self.historian.thread(host, self.cell.lanes + 1))
+            if self.standing.takes_place:
+                host.start(self.standing.thread(host, self.cell.lanes + 2))
 
         host.start(host.open(self.workload.growth.registered(ASPECTS), work))
 

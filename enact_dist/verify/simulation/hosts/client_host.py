@@ -281,9 +281,11 @@ class ClientNode(Host):
             self.catalogue.learn(shard, answer, sent_in=sent_in)
             self.client.knows_types(shard, self.catalogue.successions(shard))
 
-    def drive(self, lock: MultiLock) -> Thread:
+    def drive(self, lock: MultiLock, gives_up: Callable[[], bool] | None = None) -> Thread:
         """Make the lock's calls until it rests, then send what it says on leaving."""
         while True:
+            if gives_up is not None and gives_up():
+                lock.release()
             calls, wait_until_ns = lock.next_calls(self.local_ns)
             self.client.assert_invariants()
             if not calls and not lock.phase.busy:

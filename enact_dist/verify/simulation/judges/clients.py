@@ -36,6 +36,18 @@ class ClientJudge:
         self._world.tally["locks held"] += 1
         self.check_beliefs(host)
 
+    def shows_news(self, entry: Entry) -> None:
+        """A lock that waits for news shows some."""
+        after = {seen.slot: (seen.version, seen.stamp_ns) for seen in entry.lock.after}
+        if not after:
+            return
+        self._world.tally["locks that waited for news"] += 1
+        shown = {
+            one.state.slot: (one.state.version, one.state.stamp_ns) for one in entry.lock.states
+        }
+        if all(shown[slot] == seen for slot, seen in after.items()):
+            self._fail("a lock that waits for news shows some", entry.id, shown, after)
+
     def check_beliefs(self, host: ClientNode) -> None:
         """I7: a client that believes in a lock now is alone with it."""
         entries = self._history.entries

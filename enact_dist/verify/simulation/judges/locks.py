@@ -46,9 +46,11 @@ class LockJudge:
             picture.lanes[message.lock[:2]] = None  # no later message of this lane counts before it
         if came is not None:
             picture.lanes[came[:2]] = None
-        if came in tenures and came not in picture.arrivals:
+        # Locks that waited for news arrive at the change, in the order of their places.
+        arrived = [tenure for lock, tenure in tenures.items() if lock not in picture.arrivals]
+        for tenure in sorted(arrived, key=lambda tenure: tenure.claim.ticket):
             picture.came += 1
-            picture.arrivals[came] = picture.came
+            picture.arrivals[tenure.lock] = picture.came
         for lock in picture.in_flight:
             if picture.origin(lock) not in picture.granted:
                 self._fail("I17 a commit in flight keeps its lock", lock)

@@ -15,6 +15,7 @@ from enact_dist.core.client.plan import Phase, Reading
 from enact_dist.core.protocol.datum import Datum, Slot
 from enact_dist.core.protocol.messages import (
     AspectEntry,
+    DatumRead,
     Fetch,
     Gone,
     Item,
@@ -101,6 +102,10 @@ class Job:
     """How long it rests after the first slice of a large datum; with this all data are large."""
     meanwhile: Callable[[], Thread] | None = None
     """What it does besides while it has its lock."""
+    after: tuple[DatumRead, ...] = ()
+    """What it has seen: its lock waits for news."""
+    gives_up: Callable[[], bool] | None = None
+    """Whether a lock that waits for news is given up."""
 
 
 class Workload:
@@ -280,12 +285,16 @@ class Workload:
 
     def do(
         self, host: ClientNode, lane: int, job: Job, *, lock_views: bool = False, attempt: int = 1
-    ) -> Thread:
-        """Do one job under one lock; where its views were of no moment, again with them locked."""
+    ) -> Steps[Entry | None]:
+        """Do one job under one lock; where its views were of no moment, again with them locked.
+
+        Returns:
+            The last lock that it asked for; None if it asked for none.
+        """
         client, growth = host.client, self.growth
         newer, lapses = growth.written_newer(host, job.items), host.catalogue.lapses
         if not (yield from growth.compared(host, job.items, newer, job.luck)):
-            return
+            return None
         items = tuple(self._with_known(host, item) for item in job.items)
         if job.kind in SETS:
             items = yield from self._captures.stamped(host, items, job.luck)
@@ -303,14 +312,17 @@ class Workload:
             )
             if not lock_views:
                 self.keepers.may_keep(host, lock, job.items)
+            if job.after and len(lock.plan.locks) == 1 and not lock.plan.views:
+                lock.after, lock.patience_ns = job.after, job.wait_ns
         entry = Entry(lock, items, job.kind, begun_ns, newer=newer)
         self._history.begin(entry)
         if kept:
             self._model.keeping.begun(entry)
         self._world.tell(job.name, "asks for", *map(told_of, items))
-        yield from host.drive(lock)
+        yield from host.drive(lock, job.gives_up)
         if lock.phase is Phase.HELD:
             self._world.tell(job.name, "has its lock")
+            self._model.of_clients.shows_news(entry)
             self._model.of_clients.holds(host, entry)
             self._model.of_clients.shows_own(own, entry)
             fits = host.catalogue.lapses == lapses or (
@@ -333,9 +345,11 @@ class Workload:
         self._model.of_clients.told(host, entry)
         if lock.no_cut:
             self._world.tally["views that became reads"] += 1
-            yield from self.do(host, lane, job, lock_views=True)
-        elif (yield from growth.looks_again(host, lock)) and attempt < ATTEMPTS_MAX:
-            yield from self.do(host, lane, job, lock_views=lock_views, attempt=attempt + 1)
+            return (yield from self.do(host, lane, job, lock_views=True))
+        if (yield from growth.looks_again(host, lock)) and attempt < ATTEMPTS_MAX:
+            again = self.do(host, lane, job, lock_views=lock_views, attempt=attempt + 1)
+            return (yield from again)
+        return entry
 
     @staticmethod
     def _with_known(host: ClientNode, item: Item) -> Item:
