@@ -1,4 +1,4 @@
-"""How changes reach a running actor: one watch per world context.
+"""How changes reach a running actor whose locks do not wait for news: one watch per world context.
 
 An actor with one watch follows it in its own thread while it is idle: no other thread has to be
 woken first, and changes that arrive during an update wait in the watch's feed.  If there are

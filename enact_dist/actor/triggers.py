@@ -224,7 +224,8 @@ def tick_before(wall_ns: int, every_s: float) -> int:
 def is_news(after: Sequence[DatumRead], seen: Mapping[tuple[int, Entity], tuple[int, int]]) -> bool:
     """Whether a lock that waited for news shows some.
 
-    It may show none: if the placement changed meanwhile, it did not wait.
+    It may show none: it did not wait if the placement changed meanwhile, or if its shard may not
+    show a commit of this process yet.
 
     Args:
         after: What an actor had seen of each of its triggers.

@@ -16,12 +16,15 @@ from typing import TYPE_CHECKING, Final, Protocol
 from enact_dist.errors import ConfigError, LinkError, MisuseError
 
 if TYPE_CHECKING:
+    import threading
     from collections.abc import Callable, Mapping, Sequence
 
     from enact_dist.core.protocol.messages import Answer, Notice, Request, ShardEntry, Survey
     from enact_dist.link.notices import Skipped
 
 
+LOOK_S: Final = 0.1
+"""How often a waiting thread looks at an interrupt."""
 FORKED_REMEDY: Final = (
     "connect for the first time after the fork, or start the child with the 'spawn' method"
     " (multiprocessing.get_context('spawn'))"
@@ -117,10 +120,18 @@ class Carrier(Protocol):
     def fetch_bytes(self) -> int:
         """The largest slice of a datum that one call requests, in bytes."""
 
-    def request(self, shard: str, message: Request, *, timeout_s: float) -> Answer | None:
+    def request(
+        self,
+        shard: str,
+        message: Request,
+        *,
+        timeout_s: float,
+        interrupt: threading.Event | None = None,
+    ) -> Answer | None:
         """Send one request and return its answer, or None if none came in time.
 
-        None may come at once if the shard is known to be away; pause before a retry.
+        None may come at once if the shard is known to be away; pause before a retry.  Over a
+        socket, and within a process, None also comes within 0.1 s after `interrupt` is set.
 
         Raises:
             ProtocolError: The peer sent a message that this version cannot read, or two daemons

@@ -43,10 +43,13 @@ class _Vanishing:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._inner, name)
 
-    def request(self, shard: str, message: Request, *, timeout_s: float) -> Answer | None:
+    def request(
+        self, shard: str, message: Request, *, timeout_s: float, interrupt: Any = None
+    ) -> Answer | None:
         if isinstance(message, Commit):
             os.kill(os.getpid(), signal.SIGKILL)
-        answer: Answer | None = self._inner.request(shard, message, timeout_s=timeout_s)
+        more = {} if interrupt is None else {"interrupt": interrupt}
+        answer: Answer | None = self._inner.request(shard, message, timeout_s=timeout_s, **more)
         return answer
 
 

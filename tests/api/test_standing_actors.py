@@ -19,7 +19,7 @@ from enact_dist import (
 )
 from enact_dist.actor.binding import BoundActor
 from enact_dist.actor.running.process import ActorThread
-from enact_dist.errors import LockTimeoutError
+from enact_dist.errors import LockTimeoutError, UnknownWorldError
 
 PATIENCE_S = 20.0
 ONLINE = World("online")
@@ -170,6 +170,20 @@ def test_idle_actor_stops_at_once_and_reports_meanwhile(cell, online):
         begun_s = time.monotonic()
     assert time.monotonic() - begun_s < 5.0
     assert running.statistics().state == "stopped"
+
+
+def test_lock_that_is_refused_is_asked_for_ever_more_rarely(cell, online):
+    """A context that is gone is no reason to ask as fast as possible, and the actor does not end."""
+    extra = cell.create_world("extra")
+    actor, errors = Segmenter(), queue.Queue()
+    put(extra, 1)
+    report = lambda _entity, error: errors.put((time.monotonic(), error))  # noqa: E731
+    with ActorThread(actor, cell, {"online": "extra"}, on_error=report):
+        assert actor.saw.get(timeout=PATIENCE_S) == 1
+        cell.drop_world("extra")
+        (first_s, error), (last_s, _) = [errors.get(timeout=PATIENCE_S) for _ in range(4)][::3]
+    assert isinstance(error, UnknownWorldError)
+    assert last_s - first_s > 0.1
 
 
 class Fuser(Segmenter):

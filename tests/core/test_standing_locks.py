@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import pytest
 from client_bench import ANSWER, NOTHING, REQUEST, CellBench
-from shard_bench import ASPECTS, MS, S, ShardBench, datum, item, lock_id, slot
+from shard_bench import ASPECTS, MS, TTL_NS, S, ShardBench, datum, item, lock_id, slot
 
-from enact_dist.core.client.plan import Phase
+from enact_dist.core.client.plan import AwaitedNews, Phase
 from enact_dist.core.protocol.messages import (
     NO_PLACE,
     Acquire,
@@ -16,9 +16,9 @@ from enact_dist.core.protocol.messages import (
     Commit,
     DatumRead,
     DropWorld,
-    EpochChanged,
     Goodbye,
     Granted,
+    Hello,
     Refused,
     Register,
     Release,
@@ -26,7 +26,9 @@ from enact_dist.core.protocol.messages import (
     Waiting,
     WriteItem,
 )
-from enact_dist.core.protocol.records import Drain
+from enact_dist.core.protocol.records import Drain, SessionSeen
+from enact_dist.core.shard import owners
+from enact_dist.core.state.tenure import shape_of
 from enact_dist.terms import Access
 
 IMAGE, MASK = slot("camera", "frame"), slot("camera", "note")
@@ -119,7 +121,9 @@ class TestNews:
     def test_any_of_several_triggers_is_news(self, bench):
         """A lock may wait for more than one slot."""
         pose = DatumRead(slot("camera", "count"), 0, 0)
-        asked = bench.stand(lock_id("worker"), (*bench.image(), pose))
+        items = *ITEMS, item(Access.VIEW, "camera", "count")
+        request = bench.acquire_request(lock_id("worker"), *items)
+        asked = bench.send(replace(request, seen=(*bench.image(), pose)))
 
         bench.put(lock_id("other"), pose.slot, "x")
 
@@ -232,15 +236,55 @@ class TestEnds:
         bench.image("new")
         assert bench.answers[newer].lock == lock_id("worker", 0, 3)
 
-    def test_session_that_has_ended_is_granted_nothing(self, bench):
-        """The change finds that nobody of that name is there."""
-        asked = bench.stand(lock_id("worker"), bench.image())
-        bench.ask(Goodbye("worker"))
+    @pytest.mark.parametrize("sign", ["goodbye", "token", "lease"])
+    def test_session_that_is_gone_is_granted_nothing(self, bench, sign):
+        """A lock is not granted to a process that is dead while living ones want the data."""
+        asked = bench.stand(lock_id("worker"), bench.image(), wait_ns=900 * MS)
+        if sign == "goodbye":
+            bench.ask(Goodbye("worker"))
+        elif sign == "token":
+            bench.event(SessionSeen("worker", present=True))
+            bench.event(SessionSeen("worker", present=False))
+        else:
+            bench.wait(2 * TTL_NS, keep=["camera", "other"])
 
         bench.image("new")
 
-        assert isinstance(bench.answers[asked], EpochChanged)
+        assert bench.answers[asked].place == NO_PLACE
         assert not bench.shard.state.tenures.by_lock
+
+    def test_keep_alive_that_wants_it_no_more_ends_it(self, bench):
+        """A lost release leaves nothing parked."""
+        asked = bench.stand(lock_id("worker"), bench.image())
+
+        bench.keep_alive("worker", view={0: 2})
+
+        assert bench.answers[asked].place == NO_PLACE
+
+    def test_late_copy_of_a_lock_that_was_given_up_is_stale(self, bench):
+        """It would be granted to nobody; so would an older lock beside a newer one of its lane."""
+        seen = bench.image()
+        bench.stand(lock_id("worker", 0, 3), seen)
+
+        older = bench.stand(lock_id("worker", 0, 2), seen)
+        bench.ask(Release(lock_id("worker", 0, 3)))
+        late = bench.stand(lock_id("worker", 0, 3), seen)
+
+        assert isinstance(bench.answers[older], Stale)
+        assert isinstance(bench.answers[late], Stale)
+
+    def test_older_lock_of_the_lane_ends_when_the_news_come(self, bench):
+        """Its release was lost, so the newer lock would wait for its own lane."""
+        seen = bench.image()
+        asked = bench.stand(lock_id("worker", 0, 2), seen)
+        tenures = bench.shard.state.tenures
+        ghost = bench.acquire_request(lock_id("worker", 0, 1), item(Access.WRITE, "camera", "note"))
+        session = bench.shard.state.sessions.by_id["worker"]
+        tenures.enqueue(ghost, shape_of(ghost.items), session, now_ns=bench.now_ns, at_once=True)
+
+        bench.image("new")
+
+        assert isinstance(bench.answers[asked], Granted)
 
     def test_shard_that_drains_answers_all(self, bench):
         """No request is left parked when a shard stops."""
@@ -255,7 +299,10 @@ class TestEnds:
         bench.ask(Register("other", ("extra",), ()))
         fork = IMAGE._replace(context="extra")
         gone = bench.acquire_request(
-            lock_id("worker", 1), ITEMS[1]._replace(context="extra"), wait_ns=900 * MS
+            lock_id("worker", 1),
+            ITEMS[0],
+            ITEMS[0]._replace(context="extra"),
+            ITEMS[1]._replace(context="extra"),
         )
         asked = bench.stand(lock_id("worker"), bench.image())
         dropped = bench.send(replace(gone, seen=(*bench.seen(), DatumRead(fork, 0, 0))))
@@ -266,6 +313,34 @@ class TestEnds:
         assert isinstance(bench.answers[asked], Granted)
         assert isinstance(bench.answers[dropped], Refused)
         assert "extra" in bench.answers[dropped].text
+
+
+class TestBounds:
+    def test_only_data_of_the_lock_are_waited_for(self, bench):
+        """A lock is no way to watch other slots."""
+        strange = DatumRead(slot("robot", "frame"), 0, 0)
+
+        asked = bench.stand(lock_id("worker"), (*bench.image(), strange))
+
+        assert isinstance(bench.answers[asked], Refused)
+        assert "robot" in bench.answers[asked].text
+
+    def test_identity_has_a_share_of_what_may_be_parked(self, bench, monkeypatch):
+        """One client cannot fill the shard's list of parked requests."""
+        monkeypatch.setattr(owners, "WAITERS_MAX", 2)
+        bench.image()
+        bench.ask_as("plc@host", Hello("plc", 0, TTL_NS, "plc", "host", 1, False))
+        answers = [
+            bench.ask_as(
+                "plc@host",
+                replace(bench.acquire_request(lock_id("plc", lane), *ITEMS), seen=bench.seen()),
+            )
+            for lane in range(3)
+        ]
+
+        assert answers[:2] == [None, None]
+        assert isinstance(answers[2], Refused)
+        assert "wait for news" in answers[2].text
 
 
 class TestClient:
@@ -279,7 +354,7 @@ class TestClient:
 
     def stands(self, client, seen=NOTHING_SEEN, *, wait_s=1.0):
         lock = client.begin(*ITEMS, wait_s=wait_s)
-        lock.after, lock.patience_ns, lock.slice_ns = seen, int(wait_s * S), 0
+        lock.news, lock.slice_ns = AwaitedNews(seen, int(wait_s * S)), 0
         return lock
 
     def test_waits_for_news_as_long_as_it_takes(self, cell):

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from enact_dist.core.shard.on_lock import LockDesk, StandingLocks
+from enact_dist.core.shard.on_lock import LockDesk
+from enact_dist.core.shard.state import StandingLocks
 from enact_dist.verify.simulation.work.standing import StandingActors
 
 if TYPE_CHECKING:

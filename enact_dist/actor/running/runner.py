@@ -168,7 +168,7 @@ class ActorRun:
         self._warned = False
         self.words_in = min(context.name for context in self._bound.contexts.values())
         self._listens, self._word = False, ""
-        self._standing = False
+        self._standing = self._in_vain = False
         self._reported_ns = 0
         if self._every_s is not None:
             check_period(self.name, self._every_s)
@@ -276,7 +276,7 @@ class ActorRun:
         while not self._stop.is_set() and (slots := self._bound.trigger_slots()):
             entity = Entity(slots[0].entity)
             ending = self._attempt(entity, after=self._inbox.seen(slots))
-            if isinstance(ending, REFUSALS):
+            if isinstance(ending, REFUSALS) or self._in_vain:
                 self._stop.wait(self._pause_s(refused))
                 refused += 1
             else:
@@ -345,7 +345,7 @@ class ActorRun:
         after: tuple[DatumRead, ...] = (),
     ) -> Exception | None:
         """Run `update` once under its lock; return what ended it early."""
-        asked_ns, granted_ns = monotonic_ns(), 0
+        asked_ns, granted_ns, stale = monotonic_ns(), 0, False
         missing: list[int] = []
         seen: dict[tuple[int, Entity], tuple[int, int]] = {}
         try:
@@ -361,7 +361,8 @@ class ActorRun:
             with lock:
                 self._standing = False
                 granted_ns = monotonic_ns()
-                asked_ns = granted_ns - round(lock.statistics().waited_s * 1e9)
+                if after:
+                    asked_ns = granted_ns - round(lock.statistics().waited_s * 1e9)
                 absent = lock.absent()
                 missing = [] if self._sets is None or self._sets.sets.enough(absent) else absent
                 seen = self._seen(lock)
@@ -393,8 +394,10 @@ class ActorRun:
                 took_ns = ended_ns - granted_ns
                 self._record.updated(took_ns=took_ns, now_ns=ended_ns, wall_ns=wall_ns())
             ending = None
-        self._standing = False
-        if granted_ns or not after:
+        self._standing, self._in_vain = False, not granted_ns or stale
+        if isinstance(ending, LockTimeoutError) and after:
+            self._record.waited(round(ending.waited_s * 1e9))
+        elif granted_ns or not after:
             self._record.waited((granted_ns or monotonic_ns()) - asked_ns)
         if not isinstance(ending, REFUSALS):
             self._inbox.used(seen, standing=bool(after))

@@ -80,6 +80,13 @@ class Client(ClientSession[MultiLock]):
         self._locks[lock.lock] = lock
         return lock
 
+    def works(self) -> bool:
+        """Whether some thread holds a lock, or stands in a queue for one."""
+        locks = list(self._locks.values())
+        return any(
+            lock.news is None or not lock.news.outside or lock.parts[0].token for lock in locks
+        )
+
     def live_locks(self) -> list[MultiLock]:
         """Return the locks that are not at rest."""
         return list(self._locks.values())

@@ -31,7 +31,6 @@ from enact_dist.core.client.kept import Keeping
 from enact_dist.core.client.plan import OF_SESSIONS, Part, Phase, Plan, Reading, first_asking
 from enact_dist.core.protocol.checks import NO_PAYLOAD
 from enact_dist.core.protocol.messages import (
-    NO_PLACE,
     OUTCOME_COMMITTED,
     Answer,
     Changed,
@@ -60,6 +59,7 @@ from enact_dist.core.protocol.placement import shard_of
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from enact_dist.core.client.plan import AwaitedNews
     from enact_dist.core.client.session import ClientSession
     from enact_dist.core.protocol.datum import LockId, Position, Slot
     from enact_dist.core.protocol.messages import DatumRead, Holder, Request, SlotVersion, WriteItem
@@ -102,8 +102,7 @@ class MultiLock:
     cut: Cut | None = None
     unnamed: bool = False  # its bytes travel: the shard has lost the payloads that it named
     keeping: Keeping | None = None  # if its grant may stay with the session
-    after: tuple[DatumRead, ...] = ()  # it enters the queue once there is newer than these
-    patience_ns: int = 0  # how long it may then stay there
+    news: AwaitedNews | None = None  # what it waits for before it enters the queue
     waited_ns: int = 0  # in the queue of the last shard
     _finishing: Finishing | None = None
     _free_calls: int = FREE_CALLS
@@ -157,9 +156,9 @@ class MultiLock:
         left_ns = max(0, self.give_up_ns - now_ns)
         # The hold limit counts from the last grant; earlier ones must outlast the waiting too.
         hold_ns = self.hold_ns if part is parts[-1] else self.hold_ns + left_ns
-        wait_ns = self.slice_ns if self.after else min(self.slice_ns, left_ns)
+        wait_ns, news = min(self.slice_ns, left_ns), self.news.seen if self.news is not None else ()
         return part.shard, self.client.acquire(
-            self.lock, self.plan, part, self.after, now_ns=now_ns, wait_ns=wait_ns, hold_ns=hold_ns
+            self.lock, self.plan, part, news, now_ns=now_ns, wait_ns=wait_ns, hold_ns=hold_ns
         )
 
     def take_farewells(self) -> list[tuple[str, Request]]:
@@ -215,7 +214,7 @@ class MultiLock:
             self._epoch_changed(shard, request)
 
     def _undecided(self, request: Request, answer: Refused) -> bool:
-        """Whether a refusal leaves a commit open: a busy shard has not looked at it."""
+        """Whether a refusal leaves open what became of a commit: an earlier copy may stand."""
         if self.phase is not Phase.COMMITTING or not self.sent_commit:
             return False
         return not isinstance(request, Commit) or answer.code == OVERLOAD
@@ -268,8 +267,9 @@ class MultiLock:
         elif isinstance(answer, Waiting):
             self.blockers = answer.blockers
             self._free_calls = 0
-            if self.after and answer.place == NO_PLACE:
-                self.give_up_ns, self._free_calls = now_ns + self.patience_ns, FREE_CALLS
+            later_ns = self.news.give_up_ns(answer, now_ns) if self.news is not None else None
+            if later_ns is not None:
+                self.give_up_ns = later_ns
             elif now_ns >= self.give_up_ns:
                 self._gives_up()
         elif isinstance(answer, Stale):

@@ -6,14 +6,21 @@ import enum
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from enact_dist.core.protocol.messages import Alive, EpochChanged, Welcome
+from enact_dist.core.protocol.messages import NO_PLACE, Alive, EpochChanged, Welcome
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from enact_dist.core.client.lease_clock import Sendings
     from enact_dist.core.protocol.datum import Token
-    from enact_dist.core.protocol.messages import Granted, Item, PlacementMap, SlotState
+    from enact_dist.core.protocol.messages import (
+        DatumRead,
+        Granted,
+        Item,
+        PlacementMap,
+        SlotState,
+        Waiting,
+    )
 
 
 class Phase(enum.Enum):
@@ -41,6 +48,8 @@ class Phase(enum.Enum):
         self.busy = text in ("acquiring", "viewing", "validating", "committing")
 
 
+OUTSIDE_NS: Final = 60_000_000_000
+"""While a lock waits for news its shard has to answer within this time, beside its patience."""
 OF_SESSIONS: Final = frozenset((Welcome, Alive, EpochChanged))
 """The answers that tell something about a session and not only about one lock."""
 
@@ -69,6 +78,28 @@ class Part:
         self.token, self.granted_count = answer.token, sendings.count
         self.until_ns = sendings.believe_until_ns(answer.count_seen, ttl_ns)
         self.hold_until_ns = sendings.believe_until_ns(answer.count_seen, answer.hold_left_ns)
+
+
+@dataclass(slots=True, eq=False)
+class AwaitedNews:
+    """What a lock waits for at its shard before it enters the queue.
+
+    Attributes:
+        seen: Data of its slots that were seen; anything newer is news.
+        patience_ns: How long it may stay in the queue.
+        outside: Whether it has no place in the queue yet, as far as is known.
+    """
+
+    seen: tuple[DatumRead, ...]
+    patience_ns: int
+    outside: bool = True
+
+    def give_up_ns(self, answer: Waiting, now_ns: int) -> int | None:
+        """Return until when to go on after an answer; None where it stood in the queue before."""
+        before, self.outside = self.outside, answer.place == NO_PLACE
+        if self.outside:
+            return now_ns + self.patience_ns + OUTSIDE_NS
+        return now_ns + self.patience_ns if before else None
 
 
 def first_asking(parts: Iterable[Part]) -> Part | None:

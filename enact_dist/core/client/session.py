@@ -289,7 +289,17 @@ class ClientSession(Generic[L]):
         wait_ns: int,
         hold_ns: int,
     ) -> Acquire:
-        """Return the next request for one part of a lock, which waits for news after this."""
+        """Return the next request for one part of a lock.
+
+        Args:
+            lock: The lock.
+            plan: Where it lies.
+            part: What it asks for at this shard.
+            after: It enters the queue once the shard has newer data than these; empty: at once.
+            now_ns: The session's clock.
+            wait_ns: How long this call may be parked.
+            hold_ns: Hold limit after the grant.
+        """
         peer = self.peer(part.shard)
         return Acquire(
             lock,

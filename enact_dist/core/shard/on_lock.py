@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import heapq
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.checks import unknown_world, wrong_access
 from enact_dist.core.protocol.datum import Column, Datum, LockId
 from enact_dist.core.protocol.messages import (
-    NO_PLACE,
     Acquire,
     Answer,
     EpochChanged,
@@ -20,12 +18,10 @@ from enact_dist.core.protocol.messages import (
     Released,
     Slice,
     Stale,
-    Waiting,
     WrongShard,
 )
 from enact_dist.core.protocol.records import Effect, Reply
 from enact_dist.core.shard import owners
-from enact_dist.core.state.grants import STALE_ENDS_MAX, WAIT_SLICE_NS_MAX
 from enact_dist.core.state.sessions import LANES_MAX, Lane, SessionState
 from enact_dist.core.state.tenure import Shape, shape_of
 from enact_dist.terms import ACCESSES
@@ -51,118 +47,12 @@ DAMAGED: Final = "damaged"
 """The code of a refusal because the stored bytes of a datum are not what was stored."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Standing:
-    """The request of a lock that waits for news, and until when it may be parked."""
-
-    message: Acquire
-    reply_to: int
-    until_ns: int
-
-
-class StandingLocks:
-    """Locks that wait for newer data than their client has seen, outside the queue.
-
-    Such a lock is its parked request and nothing else: when its slice of waiting ends, or word is
-    lost, the client asks again, and the shard compares anew.  So nothing here survives, is repaired
-    or is given back.
-
-    Rule a change must keep
-      * The shard compares when a request comes, and at each change: news between two requests of a
-        client are found by the next one.
-
-    Attributes:
-        by_lane: The parked requests, by session and lane.
-    """
-
-    def __init__(self) -> None:
-        self.by_lane: dict[tuple[str, int], _Standing] = {}
-        self._by_slot: dict[Slot, dict[tuple[str, int], None]] = {}
-        self._ends: list[tuple[int, int, tuple[str, int]]] = []
-
-    def park(self, message: Acquire, *, reply_to: int, now_ns: int) -> Iterator[Effect]:
-        """Keep a request until there is news or its slice ends; the older one of its lane ends."""
-        lane = message.lock.session, message.lock.lane
-        yield from self._end(lane)
-        wait_ns = max(0, min(message.wait_ns, WAIT_SLICE_NS_MAX))
-        standing = self.by_lane[lane] = _Standing(message, reply_to, now_ns + wait_ns)
-        for seen in message.seen:
-            self._by_slot.setdefault(seen.slot, {})[lane] = None
-        if not wait_ns:
-            yield from self._end(lane)
-            return
-        if len(self._ends) > 2 * len(self.by_lane) + STALE_ENDS_MAX:
-            self._ends = [(one.until_ns, one.reply_to, lane) for lane, one in self.by_lane.items()]
-            heapq.heapify(self._ends)
-        heapq.heappush(self._ends, (standing.until_ns, reply_to, lane))
-
-    def take(self, slots: Iterable[Slot]) -> list[_Standing]:
-        """Return what waits for news of these slots, longest first, and forget it."""
-        lanes = dict.fromkeys(lane for slot in slots for lane in self._by_slot.get(slot, ()))
-        return [self._forget(lane) for lane in lanes]
-
-    def drop(self, lock: LockId) -> Iterator[Effect]:
-        """End the waiting of a lock that its client gives up."""
-        lane = lock.session, lock.lane
-        found = self.by_lane.get(lane)
-        if found is not None and found.message.lock == lock:
-            yield from self._end(lane)
-
-    def end_slices(self, now_ns: int) -> Iterator[Effect]:
-        """Answer the requests whose slice of waiting is over."""
-        while self._ends and self._ends[0][0] <= now_ns:
-            _, reply_to, lane = heapq.heappop(self._ends)
-            found = self.by_lane.get(lane)
-            if found is not None and found.reply_to == reply_to:
-                yield from self._end(lane)
-
-    def end_all(self) -> Iterator[Effect]:
-        """Answer all: the shard is about to stop."""
-        for lane in list(self.by_lane):
-            yield from self._end(lane)
-
-    def assert_invariants(self) -> None:
-        """Assert the bookkeeping.  For tests and simulation."""
-        by_slot: dict[Slot, set[tuple[str, int]]] = {}
-        for lane, standing in self.by_lane.items():
-            for seen in standing.message.seen:
-                by_slot.setdefault(seen.slot, set()).add(lane)
-        assert by_slot == {slot: {*lanes} for slot, lanes in self._by_slot.items()}
-        ends = {(reply_to, lane) for _, reply_to, lane in self._ends}
-        assert ends >= {(one.reply_to, lane) for lane, one in self.by_lane.items()}
-
-    def next_deadline_ns(self) -> int | None:
-        """Return when the next slice ends."""
-        return self._ends[0][0] if self._ends else None
-
-    def _end(self, lane: tuple[str, int]) -> Iterator[Effect]:
-        if lane in self.by_lane:
-            found = self._forget(lane)
-            lock, epoch = found.message.lock, found.message.epoch
-            yield Reply(found.reply_to, Waiting(lock, epoch, NO_PLACE, ()))
-
-    def _forget(self, lane: tuple[str, int]) -> _Standing:
-        found = self.by_lane.pop(lane)
-        for seen in found.message.seen:
-            waiting = self._by_slot.get(seen.slot)
-            if waiting is not None:
-                waiting.pop(lane, None)
-                if not waiting:
-                    del self._by_slot[seen.slot]
-        return found
-
-
 class LockDesk:
-    """Everything about who gets which lock, and the data that come with it.
-
-    Attributes:
-        standing: The locks that wait for newer data before they enter the queue.
-    """
+    """Everything about who gets which lock, and the data that come with it."""
 
     def __init__(self, state: ShardState, prepares: PrepareDesk) -> None:
         self._state = state
         self._prepares = prepares
-        self.standing = StandingLocks()
 
     def on_acquire(self, message: Acquire, reply_to: int) -> Iterable[Effect]:
         """Queue a lock, or continue with one that is already queued or granted."""
@@ -188,7 +78,7 @@ class LockDesk:
             if lock.session in tenures.by_session or state.pins.by_session:
                 effects += self._supersede(lock)
             if message.seen and not self._has_news(message):
-                effects += self.standing.park(message, reply_to=reply_to, now_ns=state.now_ns)
+                effects += self._park_standing(message, reply_to, session)
                 return effects
             tenure = self._enqueue(message, session, shape, effects)
         self._grant_or_park(tenure, message, reply_to, message.wait_ns, effects)
@@ -224,6 +114,22 @@ class LockDesk:
 
     # ---------------------------------------------------------------- locks that wait for news
 
+    def _park_standing(
+        self, message: Acquire, reply_to: int, session: SessionState
+    ) -> Iterable[Effect]:
+        """Keep a request until there is news, unless it cannot or its identity has too many."""
+        state, standing = self._state, self._state.standing
+        locked = {(item.context, item.entity, item.aspect) for item in message.items}
+        strange = [seen.slot for seen in message.seen if tuple(seen.slot) not in locked]
+        if strange:
+            text = f"{strange[0]} was seen and is not requested; a lock waits for news of its data"
+            return [Reply(reply_to, Refused("value", text))]
+        identity = session.identity
+        if identity and standing.count_of(identity) >= owners.WAITERS_MAX:
+            bound = f"{owners.WAITERS_MAX} locks that wait for news"
+            return state.quotas.refuse(reply_to, identity, bound)
+        return standing.park(message, reply_to=reply_to, now_ns=state.now_ns, owner=identity)
+
     def _has_news(self, message: Acquire) -> bool:
         """Whether a slot shows a datum that is not the one which the client has seen."""
         slots = self._state.slots
@@ -237,7 +143,7 @@ class LockDesk:
     def begin_standing(self, changed: Iterable[Slot]) -> list[Effect]:
         """Let the locks that wait for news of these slots enter the queue."""
         state, effects = self._state, list[Effect]()
-        for waiting in self.standing.take(changed):
+        for waiting in self._state.standing.take(changed):
             message, reply_to = waiting.message, waiting.reply_to
             session = state.sessions.by_id.get(message.lock.session)
             left_ns = max(0, waiting.until_ns - state.now_ns)
@@ -246,7 +152,7 @@ class LockDesk:
                 continue
             if not self._has_news(message):
                 again = replace(message, wait_ns=left_ns)
-                effects += self.standing.park(again, reply_to=reply_to, now_ns=state.now_ns)
+                effects += self._park_standing(again, reply_to, session)
                 continue
             shape = state.tenures.shapes.get(message.items)
             refusal = self.refused(message.map_version, message.items, shape)
@@ -258,6 +164,7 @@ class LockDesk:
                 effects += kept_out
                 continue
             state.count("standing_locks_begun")
+            effects += self._supersede(message.lock)
             tenure = self._enqueue(message, session, shape, effects)
             self._grant_or_park(tenure, message, reply_to, left_ns, effects)
         return effects
@@ -273,6 +180,9 @@ class LockDesk:
                 state.count("newer_types_missed")
                 return [Reply(reply_to, missed)]
         lanes, tenures = session.lanes, state.tenures
+        if state.standing.by_lane and state.standing.newer(lock):
+            state.count("stale")
+            return [Reply(reply_to, Stale(lock, state.epoch))]
         if lock.lane not in lanes:
             if len(lanes) >= LANES_MAX:
                 return [Reply(reply_to, Refused("overload", f"{LANES_MAX} lanes in one session"))]
@@ -423,8 +333,10 @@ class LockDesk:
                 lane.top = max(lane.top, lock.seq)  # a late copy of its commit is fenced
         if lock.session in state.pins.by_session:
             state.pins.drop(lock)
-        if self.standing.by_lane:
-            effects += self.standing.drop(lock)
+        if state.standing.by_lane and state.standing.has(lock):
+            effects += state.standing.drop(lock)
+            lane = state.sessions.by_id[lock.session].lane(lock.lane)
+            lane.top = max(lane.top, lock.seq)  # a late copy of its request is stale
         effects += (Reply(reply_to, Released()),)
         return effects
 

@@ -217,6 +217,8 @@ class SessionDesk:
                 yield Story("lock.orphan", f"{told}, freed: its client no longer wants it")
                 yield from self._state.tenures.remove(tenure, now_ns=self._state.now_ns)
         self._state.pins.drop_older(message.session, lowest)
+        if self._state.standing.by_lane:
+            yield from self._state.standing.drop_session(message.session, lowest)
         grants = tuple(
             [
                 GrantLeft(
@@ -262,6 +264,7 @@ class SessionDesk:
                 yield from self._state.tenures.take_away(tenure, cause, now_ns=self._state.now_ns)
             tenure.keepable = False
         self._state.pins.drop_session(session)
+        yield from self._state.standing.drop_session(session)
         self._state.sessions.forget(session)
         self._state.tenures.session_ended(session)
         self._state.tenures.kept.session_ended(session)
@@ -286,3 +289,4 @@ class SessionDesk:
                     self._state.count("waiters_dropped")
                     yield from self._state.tenures.remove(tenure, now_ns=self._state.now_ns)
                     self._state.forget_top(tenure.lock)
+            yield from self._state.standing.drop_session(message.session)

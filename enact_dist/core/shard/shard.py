@@ -222,7 +222,7 @@ class Shard:
             decided = not state.stored or type(message) in _DECIDE
             effects += self._views.answer_parked(decided=decided)
             effects += self._worlds.answer_waiting(decided=decided)
-        if self._locks.standing.by_lane:
+        if state.standing.by_lane:
             changed = [
                 change.slot
                 for effect in effects
@@ -264,9 +264,10 @@ class Shard:
             )
             if soonest is not None
         ]
-        standing = self._locks.standing
-        desks = self._prepares, self._stamps, self._views, self._worlds, state.decisions, standing
-        for desk in desks:
+        for desk in (
+            self._prepares, self._stamps, self._views, self._worlds, state.decisions,
+            state.standing,
+        ):  # fmt: skip
             due_ns = desk.next_deadline_ns()
             if due_ns is not None:
                 deadlines.append(due_ns)
@@ -338,7 +339,7 @@ class Shard:
             yield from self._sessions.end(idle.session, "its session stayed away")
         yield from self.state.grant_ready()
         yield from self.state.tenures.end_slices(now_ns)
-        yield from self._locks.standing.end_slices(now_ns)
+        yield from self.state.standing.end_slices(now_ns)
         yield from self._stamps.answer_reached()
         yield from self._prepares.ask()
         yield from self.state.decisions.tell(now_ns)
@@ -360,6 +361,7 @@ class Shard:
                 cause = f"its lease of {ttl_s:g} s expired without a sign of life"
                 yield from self.state.tenures.take_away(tenure, cause, now_ns=self.state.now_ns)
         self.state.pins.drop_session(session)
+        yield from self.state.standing.drop_session(session)
 
     def _on_drain(self, _: Drain, __: int) -> Iterator[Effect]:
         self.state.draining = True
@@ -370,7 +372,7 @@ class Shard:
         for tenure in list(self.state.tenures.by_lock.values()):
             if tenure.parked is not None:
                 yield self.state.tenures.waiting(tenure, self.state.now_ns)
-        yield from self._locks.standing.end_all()
+        yield from self.state.standing.end_all()
         yield from self._stamps.answer_all()
 
     # ---------------------------------------------------------------- people
@@ -433,7 +435,7 @@ class Shard:
         """Assert I1, I8, I10, I11 and the bookkeeping of all parts.  For tests and simulation."""
         self._prepares.assert_invariants()
         self.state.tenures.assert_invariants()
-        self._locks.standing.assert_invariants()
+        self.state.standing.assert_invariants()
         self._worlds.assert_invariants()
         self.state.slots.assert_invariants()
         if self.state.sessions.in_grace(self.state.now_ns):

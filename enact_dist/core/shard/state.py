@@ -6,26 +6,29 @@ the desk that the message is for.
 
 from __future__ import annotations
 
-from collections import defaultdict
+import heapq
+from collections import Counter, defaultdict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.messages import (
+    NO_PLACE,
     AspectEntry,
     Broken,
     EpochChanged,
     PlacementMap,
     Refused,
+    Waiting,
     WorldEntry,
 )
-from enact_dist.core.protocol.records import Persist
+from enact_dist.core.protocol.records import Effect, Persist, Reply
 from enact_dist.core.shard.owners import Quotas
 from enact_dist.core.state.audit import Audit
 from enact_dist.core.state.catalogue import Catalogue
 from enact_dist.core.state.clock import Stamps, newest_stamp
 from enact_dist.core.state.commits import Commits
 from enact_dist.core.state.decisions import Decisions
-from enact_dist.core.state.grants import Tenures
+from enact_dist.core.state.grants import STALE_ENDS_MAX, WAIT_SLICE_NS_MAX, Tenures
 from enact_dist.core.state.sessions import LANES_MAX, SessionState, SessionTable
 from enact_dist.core.state.slots import SlotMap
 
@@ -34,6 +37,7 @@ if TYPE_CHECKING:
 
     from enact_dist.core.protocol.datum import Datum, LockId, Slot
     from enact_dist.core.protocol.messages import (
+        Acquire,
         Answer,
         Break,
         DropWorld,
@@ -41,7 +45,7 @@ if TYPE_CHECKING:
         Fork,
         KeepVersions,
     )
-    from enact_dist.core.protocol.records import Effect, Record, Recovered, Then
+    from enact_dist.core.protocol.records import Record, Recovered, Then
     from enact_dist.core.state.tenure import Tenure
     from enact_dist.terms import Durability
 
@@ -140,6 +144,134 @@ class Pins:
         self.by_session.pop(session, None)
 
 
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """The request of a lock that waits for news, until when it may be parked, and whose it is."""
+
+    message: Acquire
+    reply_to: int
+    until_ns: int
+    owner: str
+
+
+class StandingLocks:
+    """Locks that wait for newer data than their client has seen, outside the queue.
+
+    Such a lock is its parked request and nothing else: when its slice of waiting ends, or word is
+    lost, the client asks again, and the shard compares anew.  So nothing here survives, is repaired
+    or is given back.
+
+    Rule a change must keep
+      * The shard compares when a request comes, and at each change: news between two requests of a
+        client are found by the next one.
+
+    Attributes:
+        by_lane: The parked requests, by session and lane.
+    """
+
+    def __init__(self) -> None:
+        self.by_lane: dict[tuple[str, int], Standing] = {}
+        self._by_slot: dict[Slot, dict[tuple[str, int], None]] = {}
+        self._ends: list[tuple[int, int, tuple[str, int]]] = []
+        self._of: Counter[str] = Counter()
+
+    def newer(self, lock: LockId) -> bool:
+        """Whether a newer lock of the lane waits here already."""
+        found = self.by_lane.get((lock.session, lock.lane))
+        return found is not None and found.message.lock.seq > lock.seq
+
+    def count_of(self, owner: str) -> int:
+        """Return how many requests of an identity are parked."""
+        return self._of[owner]
+
+    def park(self, message: Acquire, *, reply_to: int, now_ns: int, owner: str) -> Iterator[Effect]:
+        """Keep a request until there is news or its slice ends; the older one of its lane ends."""
+        lane = message.lock.session, message.lock.lane
+        yield from self._end(lane)
+        wait_ns = max(0, min(message.wait_ns, WAIT_SLICE_NS_MAX))
+        standing = self.by_lane[lane] = Standing(message, reply_to, now_ns + wait_ns, owner)
+        self._of[owner] += 1
+        for seen in message.seen:
+            self._by_slot.setdefault(seen.slot, {})[lane] = None
+        if not wait_ns:
+            yield from self._end(lane)
+            return
+        if len(self._ends) > 2 * len(self.by_lane) + STALE_ENDS_MAX:
+            self._ends = [(one.until_ns, one.reply_to, lane) for lane, one in self.by_lane.items()]
+            heapq.heapify(self._ends)
+        heapq.heappush(self._ends, (standing.until_ns, reply_to, lane))
+
+    def take(self, slots: Iterable[Slot]) -> list[Standing]:
+        """Return what waits for news of these slots, and forget it."""
+        lanes = dict.fromkeys(lane for slot in slots for lane in self._by_slot.get(slot, ()))
+        return [self._forget(lane) for lane in lanes]
+
+    def has(self, lock: LockId) -> bool:
+        """Whether this lock waits here."""
+        found = self.by_lane.get((lock.session, lock.lane))
+        return found is not None and found.message.lock == lock
+
+    def drop(self, lock: LockId) -> Iterator[Effect]:
+        """End the waiting of a lock that its client gives up."""
+        if self.has(lock):
+            yield from self._end((lock.session, lock.lane))
+
+    def drop_session(
+        self, session: str, lowest: Mapping[int, int] | None = None
+    ) -> Iterator[Effect]:
+        """End the waiting of a session, or of its locks below the lowest seq of their lane."""
+        for lane, found in list(self.by_lane.items()):
+            unwanted = lowest is None or found.message.lock.seq < lowest.get(lane[1], 0)
+            if lane[0] == session and unwanted:
+                yield from self._end(lane)
+
+    def end_slices(self, now_ns: int) -> Iterator[Effect]:
+        """Answer the requests whose slice of waiting is over."""
+        while self._ends and self._ends[0][0] <= now_ns:
+            _, reply_to, lane = heapq.heappop(self._ends)
+            found = self.by_lane.get(lane)
+            if found is not None and found.reply_to == reply_to:
+                yield from self._end(lane)
+
+    def end_all(self) -> Iterator[Effect]:
+        """Answer all: the shard is about to stop."""
+        for lane in list(self.by_lane):
+            yield from self._end(lane)
+
+    def assert_invariants(self) -> None:
+        """Assert the bookkeeping.  For tests and simulation."""
+        by_slot: dict[Slot, set[tuple[str, int]]] = {}
+        for lane, standing in self.by_lane.items():
+            for seen in standing.message.seen:
+                by_slot.setdefault(seen.slot, set()).add(lane)
+        assert by_slot == {slot: {*lanes} for slot, lanes in self._by_slot.items()}
+        ends = {(reply_to, lane) for _, reply_to, lane in self._ends}
+        assert ends >= {(one.reply_to, lane) for lane, one in self.by_lane.items()}
+
+    def next_deadline_ns(self) -> int | None:
+        """Return when the next slice ends."""
+        return self._ends[0][0] if self._ends else None
+
+    def _end(self, lane: tuple[str, int]) -> Iterator[Effect]:
+        if lane in self.by_lane:
+            found = self._forget(lane)
+            lock, epoch = found.message.lock, found.message.epoch
+            yield Reply(found.reply_to, Waiting(lock, epoch, NO_PLACE, ()))
+
+    def _forget(self, lane: tuple[str, int]) -> Standing:
+        found = self.by_lane.pop(lane)
+        self._of[found.owner] -= 1
+        if not self._of[found.owner]:
+            del self._of[found.owner]
+        for seen in found.message.seen:
+            waiting = self._by_slot.get(seen.slot)
+            if waiting is not None:
+                waiting.pop(lane, None)
+                if not waiting:
+                    del self._by_slot[seen.slot]
+        return found
+
+
 class ShardState:
     """Slots, sessions, locks and commits of one shard at one moment.
 
@@ -149,6 +281,7 @@ class ShardState:
         wall_ns: Wall clock at that moment; for timestamps only.
         peers: The other shards of the cell.
         pins: Data that a view without a lock keeps fetchable.
+        standing: The locks that wait for newer data before they enter the queue.
         busy_worlds: The operation in progress on a context of this name, which is unusable
             meanwhile.
         by_hand: The last lock broken and the last one aborted by operators: request and answer.
@@ -170,6 +303,7 @@ class ShardState:
         self._ticket = 0
         self.counters: dict[str, int] = defaultdict(int)
         self.pins = Pins()
+        self.standing = StandingLocks()
         self.busy_worlds: dict[str, str] = {}
         self.doubled: dict[str, tuple[int, ...]] = {}
         self.by_hand: dict[type, tuple[Break | ForceAbort, Broken]] = {}

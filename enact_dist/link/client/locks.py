@@ -10,7 +10,6 @@ A lock's calls run in the caller's own thread.  Rules a change must keep:
 
 from __future__ import annotations
 
-import itertools
 import logging
 import random
 from dataclasses import replace
@@ -19,7 +18,7 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.core.client.backoff import CALLED_NS_MAX, CALLED_NS_MIN, Backoff
 from enact_dist.core.client.kept import Keeping
 from enact_dist.core.client.lock import MultiLock
-from enact_dist.core.client.plan import Phase
+from enact_dist.core.client.plan import AwaitedNews, Phase
 from enact_dist.core.protocol.messages import (
     OUTCOME_COMMITTED,
     OUTCOME_PENDING,
@@ -33,6 +32,7 @@ from enact_dist.core.protocol.messages import (
     Release,
     Versions,
 )
+from enact_dist.core.protocol.placement import shard_of
 from enact_dist.core.shard.on_lock import NEWER_TYPE
 from enact_dist.errors import CommitUnknownError, EnactError, MisuseError
 from enact_dist.link.client.calls import BYTES_PER_S_MIN, CALL_S, bytes_with, request_timeout_s
@@ -46,18 +46,22 @@ from enact_dist.link.client.session import (
 )
 from enact_dist.link.client.transfer import INLINE_BYTES_MAX, drop_staged, stage
 from enact_dist.link.refusals import error_of, not_committed, not_granted
+from enact_dist.terms import ACCESSES
 from enact_dist.wire.limits import COMMIT_BYTES_MAX
 
 if TYPE_CHECKING:
     import threading
     from collections.abc import Iterable, Mapping, Sequence
 
+    from enact_dist.core.client.plan import Plan
     from enact_dist.core.protocol.datum import Position
     from enact_dist.core.protocol.messages import DatumRead, Item, Request, SlotVersion, WriteItem
 
 _WITH_DATA: Final = (Commit, Prepare)
 INTERRUPTIBLE_SLICE_NS: Final = 120_000_000
-"""How long one call of an interruptible lock is parked."""
+"""How long one call of an interruptible lock is parked where its thread cannot look meanwhile."""
+STOPS: Final = ("socket", "call")
+"""Transports whose waiting thread looks at an interrupt."""
 RESTARTS_AT_ONCE: Final = 1
 """Retries without a pause for a lock that was lost before it was held."""
 RESTART_S_MAX: Final = 0.3
@@ -136,29 +140,33 @@ class CellClient(SessionClient):
     def _ask(self, lane: int, asked: WantedLock) -> MultiLock:
         """Ask for a lock, as often as it takes, until it is held or cannot be."""
         core, begun, interrupt = self.core, asked.begun, asked.interrupt
-        lock_views, started_ns = False, self._now_ns()
-        patience_ns = max(0, asked.give_up_ns - started_ns)
-        for attempt in itertools.count():
+        lock_views, started_ns, give_up_ns = False, self._now_ns(), asked.give_up_ns
+        patience_ns, attempt = max(0, give_up_ns - started_ns), -1
+        while True:
+            attempt += 1
             with self._mutex:
                 plan = core.plan(asked.items, lock_views=lock_views, past_ns=asked.past_ns)
                 now_ns = self._now_ns()
-                wait_ns, hold_ns = max(0, asked.give_up_ns - now_ns), asked.hold_ns
-                wait_ns = patience_ns if asked.after else wait_ns
+                wait_ns, hold_ns = max(0, give_up_ns - now_ns), asked.hold_ns
                 lock = core.begin(lane, plan, now_ns=now_ns, wait_ns=wait_ns, hold_ns=hold_ns)
                 if asked.after and len(plan.locks) == 1 and not plan.views:
-                    lock.after, lock.patience_ns = asked.after, patience_ns
+                    lock.news = AwaitedNews(asked.after, patience_ns)
                 begun.append(lock)
                 keeps = asked.keep and plan.keepable and not lock_views
                 if keeps and self.payloads.keeps(plan.locks[0][0]):
                     lock.keeping = Keeping(asked.keep)
                 for before in begun[-2:-1]:
                     before.lane_free = True  # the next lock takes over the lane
-            if interrupt is not None:
+            if interrupt is not None and not self._can_stop(plan):
                 lock.slice_ns = INTERRUPTIBLE_SLICE_NS
             self._drive(lock, interrupt=interrupt)
             if lock.phase is Phase.HELD:
                 return lock
-            over = attempt > 0 and self._now_ns() >= asked.give_up_ns
+            if lock.news is not None:  # its time begins when it enters the queue
+                attempt = 0 if lock.news.outside else attempt
+                started_ns = self._now_ns() if lock.news.outside else lock.give_up_ns - patience_ns
+                give_up_ns = started_ns + patience_ns
+            over = attempt > 0 and self._now_ns() >= give_up_ns
             if over or not self._begins_anew(lock, attempt):
                 break
             lock_views = lock.no_cut and not core.observer and not asked.past_ns
@@ -169,9 +177,16 @@ class CellClient(SessionClient):
 
     def stands_alone(self, items: tuple[Item, ...]) -> bool:
         """Whether a lock of these lies on one shard, so that it can wait there for news."""
-        with self._mutex:
-            plan = self.core.plan(items)
-        return len(plan.locks) == 1 and not plan.views
+        placement = self.core.placement
+        if len(placement.shards) == 1:
+            return True
+        if any(ACCESSES[item.access].each for item in items):
+            return False
+        return len({shard_of(item.entity, placement) for item in items}) == 1
+
+    def _can_stop(self, plan: Plan) -> bool:
+        """Whether a call may be parked for long because its thread can look at an interrupt."""
+        return len(plan.locks) == 1 and self.carrier.transport_of(plan.locks[0][0]) in STOPS
 
     def _release_of(self, lane: int) -> MultiLock | None:
         """Release the lock of a lane, even one that an interrupt kept from being recorded.
@@ -239,7 +254,13 @@ class CellClient(SessionClient):
                 if len(calls) == 1 and not self._further.doubted:
                     shard, request = calls[0]
                     timeout_s = request_timeout_s(request)
-                    answers = [self.carrier.request(shard, request, timeout_s=timeout_s)]
+                    answers = [
+                        self.carrier.request(shard, request, timeout_s=timeout_s)
+                        if interrupt is None
+                        else self.carrier.request(
+                            shard, request, timeout_s=timeout_s, interrupt=interrupt
+                        )
+                    ]
                 else:
                     answers = self._send(calls)
                 with self._mutex:

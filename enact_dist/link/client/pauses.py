@@ -150,7 +150,7 @@ class Renewal:
         core, away = self._core, self._carrier.away
         with self._mutex:
             now_ns = self._now_ns()
-            if core.live_locks():
+            if core.works():
                 self._signs.used(now_ns, core.ttl_ns)
             self._rests_long = not self._signs.is_used(now_ns)
             return self._signs.pause_ns(core.shards_in_use(), away, core.ttl_ns, now_ns) / 1e9

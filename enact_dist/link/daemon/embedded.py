@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.records import SessionSeen
 from enact_dist.errors import MisuseError, ShardUnreachableError
+from enact_dist.link.carrier import LOOK_S
 from enact_dist.link.notices import NoticeQueue
 
 if TYPE_CHECKING:
@@ -73,7 +74,14 @@ class EmbeddedCarrier:
         self._feeds: set[NoticeQueue] = set()
         host.event(SessionSeen(session, present=True))
 
-    def request(self, shard: str, message: Request, *, timeout_s: float) -> Answer | None:
+    def request(
+        self,
+        shard: str,
+        message: Request,
+        *,
+        timeout_s: float,
+        interrupt: threading.Event | None = None,
+    ) -> Answer | None:
         """Call the shard; return None if it parks the call beyond `timeout_s`, or fails.
 
         Raises:
@@ -81,7 +89,13 @@ class EmbeddedCarrier:
             MisuseError: The carrier is closed or was opened before a fork.
         """
         call = self.begin(shard, message, timeout_s=timeout_s)
-        return call.answer if call.answer is not None else call.wait()
+        if call.answer is not None or interrupt is None:
+            return call.answer if call.answer is not None else call.wait()
+        end_s = time.monotonic() + timeout_s
+        while not call.done.acquire(timeout=LOOK_S):
+            if interrupt.is_set() or time.monotonic() >= end_s:
+                break
+        return call.answer
 
     def request_all(
         self, requests: Sequence[tuple[str, Request]], *, timeout_s: float

@@ -87,7 +87,14 @@ class SocketCarrier:
 
     # ---------------------------------------------------------------- requests
 
-    def request(self, shard: str, message: Request, *, timeout_s: float) -> Answer | None:
+    def request(
+        self,
+        shard: str,
+        message: Request,
+        *,
+        timeout_s: float,
+        interrupt: threading.Event | None = None,
+    ) -> Answer | None:
         """Send one request and return its answer, or None if none came in time.
 
         Raises:
@@ -104,7 +111,7 @@ class SocketCarrier:
             answer = self._behind.request(shard, message, timeout_s=timeout_s)
         else:
             self.calls["socket"] += 1
-            answer = _received(line, connection)
+            answer = _received(line, connection, interrupt=interrupt)
         if type(answer) is Welcome:
             self.learn(answer)
         return answer
@@ -370,10 +377,16 @@ class _Begun:
 
 
 def _received(
-    line: SocketLine, connection: Connection, into: memoryview | None = None
+    line: SocketLine,
+    connection: Connection,
+    into: memoryview | None = None,
+    *,
+    interrupt: threading.Event | None = None,
 ) -> Answer | None:
     """Return the answer on a connection, or None if none will come."""
     try:
+        if interrupt is not None:
+            connection.wait(interrupt)
         answer = connection.receive(into)
     except BlockingIOError:  # the time is over
         line.drop(connection)

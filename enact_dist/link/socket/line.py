@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.messages import Answer, Notice
 from enact_dist.errors import EnactError, LinkError, ProtocolError
+from enact_dist.link.carrier import LOOK_S
 from enact_dist.link.memory.shared_folder import open_shared
 from enact_dist.link.notices import Skipped
 from enact_dist.link.socket.frames import (
@@ -96,6 +97,17 @@ class Connection:
             self._wait_s = rounded_s(timeout_s)
             wait_at_most(self.socket, socket.SO_RCVTIMEO, self._wait_s)
         send_frame(self.socket, header, bodies)
+
+    def wait(self, interrupt: threading.Event) -> None:
+        """Wait until an answer begins to arrive, and look at an interrupt meanwhile.
+
+        Raises:
+            BlockingIOError: Time is up, or the interrupt is set.
+        """
+        end_s = time.monotonic() + self._wait_s
+        while not self._poll.poll(LOOK_S * 1e3):
+            if interrupt.is_set() or time.monotonic() >= end_s:
+                raise BlockingIOError(errno.EAGAIN, "no answer in time, or interrupted")
 
     def receive(self, into: memoryview | None = None) -> Answer:
         """Return the answer to the sent request, with its data in `into` if they fit.

@@ -216,8 +216,19 @@ class ZenohCarrier:
 
     # ---------------------------------------------------------------- requests
 
-    def request(self, shard: str, message: Request, *, timeout_s: float) -> Answer | None:
-        """Send one request and return its answer, or None if none came in time."""
+    def request(
+        self,
+        shard: str,
+        message: Request,
+        *,
+        timeout_s: float,
+        interrupt: threading.Event | None = None,
+    ) -> Answer | None:
+        """Send one request and return its answer, or None if none came in time.
+
+        A thread that waits inside Zenoh cannot look at `interrupt`.
+        """
+        del interrupt
         return self.request_all(((shard, message),), timeout_s=timeout_s)[0]
 
     def request_all(

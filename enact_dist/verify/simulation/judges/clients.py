@@ -38,9 +38,10 @@ class ClientJudge:
 
     def shows_news(self, entry: Entry) -> None:
         """A lock that waits for news shows some."""
-        after = {seen.slot: (seen.version, seen.stamp_ns) for seen in entry.lock.after}
-        if not after:
+        news = entry.lock.news
+        if news is None:
             return
+        after = {seen.slot: (seen.version, seen.stamp_ns) for seen in news.seen}
         self._world.tally["locks that waited for news"] += 1
         shown = {
             one.state.slot: (one.state.version, one.state.stamp_ns) for one in entry.lock.states

@@ -11,7 +11,7 @@ from random import Random
 from typing import TYPE_CHECKING
 
 from enact_dist.core.client.lock import MultiLock
-from enact_dist.core.client.plan import Phase, Reading
+from enact_dist.core.client.plan import AwaitedNews, Phase, Reading
 from enact_dist.core.protocol.datum import Datum, Slot
 from enact_dist.core.protocol.messages import (
     AspectEntry,
@@ -313,7 +313,7 @@ class Workload:
             if not lock_views:
                 self.keepers.may_keep(host, lock, job.items)
             if job.after and len(lock.plan.locks) == 1 and not lock.plan.views:
-                lock.after, lock.patience_ns = job.after, job.wait_ns
+                lock.news = AwaitedNews(job.after, job.wait_ns)
         entry = Entry(lock, items, job.kind, begun_ns, newer=newer)
         self._history.begin(entry)
         if kept:
