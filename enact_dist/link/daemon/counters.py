@@ -52,7 +52,6 @@ OF_A_SHARD: Final[dict[str, Figure]] = {
     "locks_granted": Figure("locks granted; those that used a kept grant are not counted"),
     "locks_validated": Figure("locks without a write here, confirmed when they ended"),
     "grants_kept": Figure("grants that stayed with their session, for its next locks of the data"),
-    "standing_locks_begun": Figure("locks that waited for news, and entered the queue at a change"),
     "grants_not_kept": Figure("grants that could not stay: no page of marks, or no room in it"),
     "grants_revoked": Figure(
         "kept grants that ended unused, because another lock asked for the data"
@@ -60,6 +59,7 @@ OF_A_SHARD: Final[dict[str, Figure]] = {
     "grants_recalled": Figure(
         "kept grants in use when another lock asked; each ended with the block that used it"
     ),
+    "standing_locks_begun": Figure("locks that waited for news, and entered the queue at a change"),
     "lock_waits": Figure(
         "locks that had to wait", "if too many: hold locks for less time, or use View"
     ),
