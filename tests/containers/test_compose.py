@@ -213,6 +213,7 @@ def test_verdicts_are_those_of_one_machine(stack, alone):
         assert (stack.out / name).stat().st_size > 20_000
 
 
+@pytest.mark.sampled(1, of="file")
 def test_started_in_another_order_it_is_as_before(stack):
     """All end by themselves; actors that are first wait for their shards; data are kept."""
     stack.compose("stop", "--timeout", 120)  # the file says 20 s, for machines in their usual state
@@ -228,6 +229,7 @@ def test_started_in_another_order_it_is_as_before(stack):
     assert len(stack.json("world", "get", "online", "user/notices")) == PACKAGES
 
 
+@pytest.mark.sampled(1, of="file")
 def test_on_two_machines_the_verdicts_are_the_same(engine, images, alone, tmp_path_factory):
     """Two projects with nothing in common but the network; the actors are up before the shards."""
     folder = tmp_path_factory.mktemp("multihost")

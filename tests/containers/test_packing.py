@@ -11,7 +11,7 @@ from stack import Stack
 
 from actors.palletizing.demo_robot_cell import TEMPLATE
 
-pytestmark = pytest.mark.containers
+pytestmark = [pytest.mark.containers, pytest.mark.sampled(1, of="applications in containers")]
 
 PACKAGES = 2
 

@@ -12,7 +12,7 @@ from actors.running_cell import toml_of
 from actors.workcell.demo_cell import TEMPLATE, configured
 from actors.workcell.demo_options import Options
 
-pytestmark = pytest.mark.containers
+pytestmark = [pytest.mark.containers, pytest.mark.sampled(1, of="applications in containers")]
 
 KILLED = "camera/3"
 
