@@ -1,6 +1,6 @@
 """Rules for all tests: nothing skipped in CI, Ctrl-C as at a terminal, no lock left behind.
 
-Which cases of long tests a run takes (`sampled`).
+Which cases of long tests (`sampled`) and which tests of the applications a run takes.
 
 And over which carrier each of them runs, see `carriers.py` beside this file.
 """
@@ -19,6 +19,10 @@ from enact_dist.access import lock
 sys.path.insert(0, str(Path(__file__).parent))
 import carriers
 import ports
+
+APPLICATIONS = Path(__file__).parent / "actors"
+"""Of the tests of the applications each run takes half of the files of a folder."""
+HALF = -1
 
 # How long an example takes says more about the machine than about what is tested.
 settings.register_profile("load", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -51,7 +55,9 @@ def pytest_collection_modifyitems(config, items):
     groups = defaultdict(lambda: defaultdict(list))
     for item in items:
         mark = item.get_closest_marker("sampled")
-        if mark is not None:
+        if mark is None and APPLICATIONS in item.path.parents:
+            groups[item.path.parent, HALF][item.path.name].append(item)
+        elif mark is not None:
             of, case = mark.kwargs.get("of", "test"), item.nodeid
             if of == "test":
                 of = f"{item.path}::{item.originalname}"
@@ -62,7 +68,8 @@ def pytest_collection_modifyitems(config, items):
             groups[of, mark.args[0]][case].append(item)
     left_out = set()
     for (_, count), cases in groups.items():
-        for case in sorted(cases, key=carriers.rank)[count:]:
+        taken = count if count != HALF else (len(cases) + 1) // 2
+        for case in sorted(cases, key=carriers.rank)[taken:]:
             left_out.update(cases[case])
     if left_out:
         config.hook.pytest_deselected(items=[item for item in items if item in left_out])

@@ -38,6 +38,7 @@ def restart(cell, *forgets):
     cell.start_all()
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("use", ["write", "view", "look_in_lock", "diff"])
 def test_who_knew_the_old_type_gets_an_error_and_no_data(make_cell, monkeypatch, use):
     """Its first act after the restart is by the old type, with a catalogue of before."""

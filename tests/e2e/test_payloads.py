@@ -99,6 +99,7 @@ def seen(run, cell, name="array", **options):
 
 
 @both
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("way", ["put", "new"])
 def test_writer_killed_while_it_fills_leaves_nothing(make_cell, run, root, way):
     """Readers keep the datum before; the draft's memory comes back while the shard lives on."""
@@ -118,6 +119,7 @@ def test_writer_killed_while_it_fills_leaves_nothing(make_cell, run, root, way):
 
 
 @both
+@pytest.mark.sampled(1)
 def test_reader_killed_while_it_maps_leaves_nothing(make_cell, run, root):
     """Its map of a replaced version was the last: the memory comes back at once."""
     cell = make_cell().start_all()

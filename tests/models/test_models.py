@@ -26,6 +26,7 @@ def checked(variant, folder):
 
 
 @pytest.mark.slow
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("model", MODELS)
 def test_model_holds_and_takes_every_step(model, tmp_path):
     """No rule breaks in any state; and no line is dead, each is executed in some state."""
