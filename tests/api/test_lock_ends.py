@@ -49,14 +49,14 @@ class Meddler:
     def __getattr__(self, name):
         return getattr(self._inner, name)
 
-    def request(self, shard, message, *, timeout_s):
+    def request(self, shard, message, *, timeout_s, **more):
         before = after = None
         if isinstance(message, self._kind):
             before, self._before = self._before, None
             after, self._after = self._after, None
         if before:
             before()
-        answer = self._inner.request(shard, message, timeout_s=timeout_s)
+        answer = self._inner.request(shard, message, timeout_s=timeout_s, **more)
         if after:
             after()
         return answer

@@ -44,8 +44,10 @@ class LosingCarrier:
             return None
         return answer
 
-    def request(self, shard, message, *, timeout_s):
-        return self._maybe(message, self._inner.request(shard, message, timeout_s=timeout_s))
+    def request(self, shard, message, *, timeout_s, **more):
+        return self._maybe(
+            message, self._inner.request(shard, message, timeout_s=timeout_s, **more)
+        )
 
     def begin(self, shard, message, *, timeout_s):
         return LosingBegun(self, message, self._inner.begin(shard, message, timeout_s=timeout_s))
@@ -121,11 +123,11 @@ def test_commit_that_never_came_through_is_known_not_to_stand(cell, online, monk
     kept = []
 
     class Swallowing(LosingCarrier):
-        def request(self, shard, message, *, timeout_s):
+        def request(self, shard, message, *, timeout_s, **more):
             if isinstance(message, Commit | Outcome):
                 kept.append(message)
                 return None
-            return super().request(shard, message, timeout_s=timeout_s)
+            return super().request(shard, message, timeout_s=timeout_s, **more)
 
     inner = cell._client.carrier
     with pytest.raises(CommitUnknownError) as caught, Lock(count) as lock:

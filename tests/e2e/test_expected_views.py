@@ -219,8 +219,8 @@ class DeafTo:
     def lost(self):
         return len(self._lost)
 
-    def request(self, shard, message, *, timeout_s):
-        answer = self._inner.request(shard, message, timeout_s=timeout_s)
+    def request(self, shard, message, *, timeout_s, **more):
+        answer = self._inner.request(shard, message, timeout_s=timeout_s, **more)
         if isinstance(message, Commit) and message.lock not in self._lost:
             self._lost.add(message.lock)
             return None

@@ -50,7 +50,7 @@ class Cell:
     def away(self, shard):
         return shard in self.gone
 
-    def request(self, shard, message, *, timeout_s):
+    def request(self, shard, message, *, timeout_s, **more):
         self.asked.append((shard, type(message)))
         if shard in self.silent:
             return None

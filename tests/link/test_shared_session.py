@@ -115,7 +115,7 @@ def test_what_was_registered_over_a_restart_is_looked_up_again(known):
     seen = []
 
     class Restarting(Carrier):
-        def request(self, shard, message, *, timeout_s):
+        def request(self, shard, message, *, timeout_s, **more):
             if isinstance(message, Register):
                 client._take(shard, client.core.hello(shard), welcome(2))
                 return Registered(("online",), (COUNT,))

@@ -87,12 +87,12 @@ class PausingCarrier:
     def __getattr__(self, name):
         return getattr(self._inner, name)
 
-    def request(self, shard, message, *, timeout_s):
+    def request(self, shard, message, *, timeout_s, **more):
         if self.pauses and isinstance(message, Commit):
             self.pauses = False
             say("prepared", shard)
             self.words.get()
-        return self._inner.request(shard, message, timeout_s=timeout_s)
+        return self._inner.request(shard, message, timeout_s=timeout_s, **more)
 
 
 class Probe(threading.Thread):
