@@ -36,7 +36,8 @@ class StandingActors:
 
     def __init__(self, world: SimulatedWorld, observed: Observations, workload: Workload) -> None:
         self._world, self._observed, self._workload = world, observed, workload
-        self.takes_place = world.schedule.stream("standing").random() < SHARE
+        draw = world.schedule.stream("asks in advance for news, or not").random()
+        self.takes_place = draw < SHARE
 
     def thread(self, host: ClientNode, lane: int) -> Thread:
         """Make something of each news until the run winds down and nothing new is left."""
