@@ -5,6 +5,7 @@ Which cases of long tests (`sampled`) and which tests of the applications a run 
 And over which carrier each of them runs, see `carriers.py` beside this file.
 """
 
+import math
 import os
 import signal
 import sys
@@ -21,8 +22,10 @@ import carriers
 import ports
 
 APPLICATIONS = Path(__file__).parent / "actors"
-"""Of the tests of the applications each run takes half of the files of a folder."""
-HALF = -1
+"""Of the tests of the applications each run takes half of the files of a folder.
+
+Of the files with other slow tests it takes the slow ones of two in three.
+"""
 
 # How long an example takes says more about the machine than about what is tested.
 settings.register_profile("load", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -56,7 +59,9 @@ def pytest_collection_modifyitems(config, items):
     for item in items:
         mark = item.get_closest_marker("sampled")
         if mark is None and APPLICATIONS in item.path.parents:
-            groups[item.path.parent, HALF][item.path.name].append(item)
+            groups[item.path.parent, 1 / 2][item.path.name].append(item)
+        elif mark is None and item.get_closest_marker("slow"):
+            groups["slow", 2 / 3][str(item.path)].append(item)
         elif mark is not None:
             of, case = mark.kwargs.get("of", "test"), item.nodeid
             if of == "test":
@@ -68,7 +73,7 @@ def pytest_collection_modifyitems(config, items):
             groups[of, mark.args[0]][case].append(item)
     left_out = set()
     for (_, count), cases in groups.items():
-        taken = count if count != HALF else (len(cases) + 1) // 2
+        taken = count if count >= 1 else math.ceil(count * len(cases))
         for case in sorted(cases, key=carriers.rank)[taken:]:
             left_out.update(cases[case])
     if left_out:

@@ -42,7 +42,7 @@ def test_model_holds_and_takes_every_step(model, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.sampled(40)
+@pytest.mark.sampled(25)
 @pytest.mark.parametrize(
     "variant", [v for v in VARIANTS if v.expects != HOLDS], ids=lambda variant: variant.name
 )
