@@ -61,7 +61,7 @@ byte rule;
 
 inline enter(s) {               /* it enters the queue, where nothing else is: granted */
   top = s; held = true; shown = newest;
-  if :: grants[s] == 0 -> grants[s] = 1 :: else -> BROKEN(1) fi;
+  if :: grants[s] -> BROKEN(1) :: else -> grants[s] = 1 fi;
   if :: s == seq && phase == ASKS -> answer = GRANT; answer_shown = shown :: else fi
 }
 

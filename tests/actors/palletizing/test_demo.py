@@ -235,6 +235,7 @@ def test_demo_runs_from_training_to_table(tmp_path, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.timing
 @pytest.mark.sampled(1, of="file")
 def test_robot_packs_from_training_to_table(tmp_path, capsys):
     """Sixteen actors train two products and pack two packages in physics; table, why, pictures."""
