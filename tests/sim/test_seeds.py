@@ -21,6 +21,8 @@ MISJUDGED = (7004196, 7005673, 9019225)
 it took a version for one that a power failure had undone, whose stamp came again."""
 
 KNOWN_BAD = {
+    "parks_without_a_look": 16,
+    "counts_lost_updates_as_seen": 57,
     "keeps_one_outcome_per_session": 17,
     "blind_acknowledgement": 23,
     "makes_drafts_of_late_slices": 206,

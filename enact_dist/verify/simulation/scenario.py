@@ -154,7 +154,7 @@ class Scenario:
                 host.start(self.forker.thread(host, self.cell.lanes))
             if self.historian.takes_place:
                 host.start(self.historian.thread(host, self.cell.lanes + 1))
-            if self.standing.takes_place:
+            if self.standing.takes_place and number == 1:
                 host.start(self.standing.thread(host, self.cell.lanes + 2))
 
         host.start(host.open(self.workload.growth.registered(ASPECTS), work))

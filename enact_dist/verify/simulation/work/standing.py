@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from enact_dist.verify.simulation.judges.history import Entry, Observations
 
 SHARE: Final = 0.25
-"""Share of the runs in which the clients have such an actor."""
+"""Share of the runs in which the first client has such an actor."""
 SEEN_NOTHING: Final = (0, 0)
 
 
@@ -63,7 +63,7 @@ class StandingActors:
                 seen, done = self._shown(entry, slot, seen), self._done(entry, slot, done)
                 if self._world.winding_down and (entry is None or entry.told is Phase.REFUSED):
                     return  # for good: of a wall clock, or of a type
-            yield Sleep(luck.choice((MS, MS, 5 * MS)))
+            yield Sleep(luck.choice((MS, 30 * MS, 150 * MS)))
 
     @staticmethod
     def _shown(entry: Entry | None, slot: Slot, seen: tuple[int, int]) -> tuple[int, int]:
