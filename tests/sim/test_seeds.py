@@ -55,7 +55,7 @@ The real core passes them, and each of these edits meets its own first.
 
 SECONDS = float(os.environ.get("ENACT_SIM_SECONDS", "10"))
 HALVES = 2
-SEEDS_MIN = 150
+SEEDS_MIN = 100
 """Even on a slow machine so many seeds run; fewer would prove nothing about rare events."""
 SEEDS_MORE, SEEDS_MAX = 50, 3000
 """While something has not happened yet, so many run again, up to a number that shows it never does."""
