@@ -51,7 +51,7 @@ def pytest_generate_tests(metafunc):
 def pytest_collection_modifyitems(config, items):
     """Leave out what a run does not take of long tests that are much alike, drawn by its seed.
 
-    `ENACT_TEST_ALL=1` takes all; so does whoever names a case alone.
+    `ENACT_TEST_ALL=1` takes all.  A case that is named alone on the command line always runs.
     """
     if os.environ.get("ENACT_TEST_ALL") == "1":
         return

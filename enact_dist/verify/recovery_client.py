@@ -48,8 +48,9 @@ class _Vanishing:
     ) -> Answer | None:
         if isinstance(message, Commit):
             os.kill(os.getpid(), signal.SIGKILL)
-        more = {} if interrupt is None else {"interrupt": interrupt}
-        answer: Answer | None = self._inner.request(shard, message, timeout_s=timeout_s, **more)
+        answer: Answer | None = self._inner.request(
+            shard, message, timeout_s=timeout_s, interrupt=interrupt
+        )
         return answer
 
 

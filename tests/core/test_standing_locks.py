@@ -262,7 +262,7 @@ class TestEnds:
         assert bench.answers[asked].place == NO_PLACE
 
     def test_late_copy_of_a_lock_that_was_given_up_is_stale(self, bench):
-        """It would be granted to nobody; so would an older lock beside a newer one of its lane."""
+        """No client waits for its grant.  An older lock beside a newer one of its lane is stale too."""
         seen = bench.image()
         bench.stand(lock_id("worker", 0, 3), seen)
 
@@ -394,7 +394,7 @@ class TestClient:
         assert left == [0]
 
     def test_gives_up_in_the_queue_after_its_patience(self, cell):
-        """A holder in the way is told of, as with any lock."""
+        """The lock names the holder that blocks it, as any lock does."""
         worker, other = cell.client("worker"), cell.client("other")
         held = other.drive(other.begin(item(Access.WRITE, "camera", "frame")))
         held.finish({"s0": [WriteItem(IMAGE, datum("i"))]}, give_up_ns=cell.now_ns + S)

@@ -20,7 +20,6 @@ def test_mutant_is_caught(mutant):
     assert caught.by, f"survived {caught.seeds} seeds: {mutant.__doc__}"
 
 
-@pytest.mark.sampled(12)
 @pytest.mark.parametrize("mutant", mutants.DIRECTED, ids=lambda mutant: mutant.__name__)
 def test_directed_test_catches_its_mutant(mutant):
     """Where the simulator does not get, a test of `tests/core` fails under the edit."""

@@ -69,26 +69,27 @@ class LockDesk:
             text = "this session only observes and cannot lock; connect without observer=True"
             return [Reply(reply_to, Refused("value", text))]
         session.renew(state.now_ns, message.count)
-        effects: list[Effect] = []
         tenure = tenures.by_lock.get(lock)
         if tenure is None:
-            refused = self._kept_out(message, session, reply_to)
-            if refused is not None:
-                return refused
-            if lock.session in tenures.by_session or state.pins.by_session:
-                effects += self._supersede(lock)
-            if message.seen and not self._has_news(message):
-                effects += self._park_standing(message, reply_to, session)
-                return effects
-            tenure = self._enqueue(message, session, shape, effects)
-        self._grant_or_park(tenure, message, reply_to, message.wait_ns, effects)
+            return self._admit(message, shape, session, reply_to)
+        effects: list[Effect] = []
+        self._grant_or_park(tenure, message, reply_to, effects)
         return effects
 
-    def _enqueue(
-        self, message: Acquire, session: SessionState, shape: Shape | None, effects: list[Effect]
-    ) -> Tenure:
-        """Give a lock its place in the queue; whom that lets go on is added to `effects`."""
+    def _admit(
+        self, message: Acquire, shape: Shape | None, session: SessionState, reply_to: int
+    ) -> Iterable[Effect]:
+        """Give a new lock its place in the queue, unless it is kept out or waits for news."""
         state, tenures, lock = self._state, self._state.tenures, message.lock
+        refused = self._kept_out(message, session, reply_to)
+        if refused is not None:
+            return refused
+        effects: list[Effect] = []
+        if lock.session in tenures.by_session or state.pins.by_session:
+            effects += self._supersede(lock)
+        if message.seen and not self._has_news(message):
+            effects += self._park_standing(message, reply_to, session)
+            return effects
         session.lanes[lock.lane].top = lock.seq
         if shape is None:
             shape = tenures.shapes.get(message.items) or shape_of(message.items)
@@ -97,10 +98,11 @@ class LockDesk:
             tenures.recall_for(tenure, now_ns=state.now_ns)
         if tenures.table.ready:
             effects += state.grant_ready()
-        return tenure
+        self._grant_or_park(tenure, message, reply_to, effects)
+        return effects
 
     def _grant_or_park(
-        self, tenure: Tenure, message: Acquire, reply_to: int, wait_ns: int, effects: list[Effect]
+        self, tenure: Tenure, message: Acquire, reply_to: int, effects: list[Effect]
     ) -> None:
         """Answer a request with the grant, or keep it until there is one."""
         state, tenures = self._state, self._state.tenures
@@ -110,7 +112,9 @@ class LockDesk:
             effects += (Reply(reply_to, granted),)
         else:
             state.count("lock_waits")
-            effects += tenures.park(tenure, reply_to=reply_to, wait_ns=wait_ns, now_ns=state.now_ns)
+            effects += tenures.park(
+                tenure, reply_to=reply_to, wait_ns=message.wait_ns, now_ns=state.now_ns
+            )
 
     # ---------------------------------------------------------------- locks that wait for news
 
@@ -143,30 +147,23 @@ class LockDesk:
     def begin_standing(self, changed: Iterable[Slot]) -> list[Effect]:
         """Let the locks that wait for news of these slots enter the queue."""
         state, effects = self._state, list[Effect]()
-        for waiting in self._state.standing.take(changed):
-            message, reply_to = waiting.message, waiting.reply_to
+        for waiting in state.standing.take(changed):
+            reply_to, left_ns = waiting.reply_to, max(0, waiting.until_ns - state.now_ns)
+            message = replace(waiting.message, wait_ns=left_ns)
             session = state.sessions.by_id.get(message.lock.session)
-            left_ns = max(0, waiting.until_ns - state.now_ns)
             if session is None or not session.present:
                 effects += (Reply(reply_to, state.epoch_changed(message.epoch)),)
-                continue
-            if not self._has_news(message):
-                again = replace(message, wait_ns=left_ns)
-                effects += self._park_standing(again, reply_to, session)
-                continue
-            shape = state.tenures.shapes.get(message.items)
-            refusal = self.refused(message.map_version, message.items, shape)
-            if refusal is not None:
-                effects += (Reply(reply_to, refusal),)
-                continue
-            kept_out = self._kept_out(message, session, reply_to)
-            if kept_out is not None:
-                effects += kept_out
-                continue
-            state.count("standing_locks_begun")
-            effects += self._supersede(message.lock)
-            tenure = self._enqueue(message, session, shape, effects)
-            self._grant_or_park(tenure, message, reply_to, left_ns, effects)
+            elif not self._has_news(message):
+                effects += self._park_standing(message, reply_to, session)
+            else:
+                shape = state.tenures.shapes.get(message.items)
+                refusal = self.refused(message.map_version, message.items, shape)
+                if refusal is not None:
+                    effects += (Reply(reply_to, refusal),)
+                    continue
+                effects += self._admit(message, shape, session, reply_to)
+                if message.lock in state.tenures.by_lock:
+                    state.count("standing_locks_begun")
         return effects
 
     def _kept_out(

@@ -6,7 +6,6 @@ the desk that the message is for.
 
 from __future__ import annotations
 
-import heapq
 from collections import Counter, defaultdict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -25,10 +24,10 @@ from enact_dist.core.protocol.records import Effect, Persist, Reply
 from enact_dist.core.shard.owners import Quotas
 from enact_dist.core.state.audit import Audit
 from enact_dist.core.state.catalogue import Catalogue
-from enact_dist.core.state.clock import Stamps, newest_stamp
+from enact_dist.core.state.clock import DueTimes, Stamps, newest_stamp
 from enact_dist.core.state.commits import Commits
 from enact_dist.core.state.decisions import Decisions
-from enact_dist.core.state.grants import STALE_ENDS_MAX, WAIT_SLICE_NS_MAX, Tenures
+from enact_dist.core.state.grants import WAIT_SLICE_NS_MAX, Tenures
 from enact_dist.core.state.sessions import LANES_MAX, SessionState, SessionTable
 from enact_dist.core.state.slots import SlotMap
 
@@ -172,7 +171,7 @@ class StandingLocks:
     def __init__(self) -> None:
         self.by_lane: dict[tuple[str, int], Standing] = {}
         self._by_slot: dict[Slot, dict[tuple[str, int], None]] = {}
-        self._ends: list[tuple[int, int, tuple[str, int]]] = []
+        self._ends = DueTimes[tuple[str, int]]()
         self._of: Counter[str] = Counter()
 
     def newer(self, lock: LockId) -> bool:
@@ -189,17 +188,13 @@ class StandingLocks:
         lane = message.lock.session, message.lock.lane
         yield from self._end(lane)
         wait_ns = max(0, min(message.wait_ns, WAIT_SLICE_NS_MAX))
-        standing = self.by_lane[lane] = Standing(message, reply_to, now_ns + wait_ns, owner)
+        self.by_lane[lane] = Standing(message, reply_to, now_ns + wait_ns, owner)
+        self._ends.put(lane, now_ns + wait_ns)
         self._of[owner] += 1
         for seen in message.seen:
             self._by_slot.setdefault(seen.slot, {})[lane] = None
         if not wait_ns:
             yield from self._end(lane)
-            return
-        if len(self._ends) > 2 * len(self.by_lane) + STALE_ENDS_MAX:
-            self._ends = [(one.until_ns, one.reply_to, lane) for lane, one in self.by_lane.items()]
-            heapq.heapify(self._ends)
-        heapq.heappush(self._ends, (standing.until_ns, reply_to, lane))
 
     def take(self, slots: Iterable[Slot]) -> list[Standing]:
         """Return what waits for news of these slots, and forget it."""
@@ -227,11 +222,8 @@ class StandingLocks:
 
     def end_slices(self, now_ns: int) -> Iterator[Effect]:
         """Answer the requests whose slice of waiting is over."""
-        while self._ends and self._ends[0][0] <= now_ns:
-            _, reply_to, lane = heapq.heappop(self._ends)
-            found = self.by_lane.get(lane)
-            if found is not None and found.reply_to == reply_to:
-                yield from self._end(lane)
+        for lane in self._ends.take(now_ns):
+            yield from self._end(lane)
 
     def end_all(self) -> Iterator[Effect]:
         """Answer all: the shard is about to stop."""
@@ -245,12 +237,11 @@ class StandingLocks:
             for seen in standing.message.seen:
                 by_slot.setdefault(seen.slot, set()).add(lane)
         assert by_slot == {slot: {*lanes} for slot, lanes in self._by_slot.items()}
-        ends = {(reply_to, lane) for _, reply_to, lane in self._ends}
-        assert ends >= {(one.reply_to, lane) for lane, one in self.by_lane.items()}
+        assert self._ends.due == {lane: one.until_ns for lane, one in self.by_lane.items()}
 
     def next_deadline_ns(self) -> int | None:
         """Return when the next slice ends."""
-        return self._ends[0][0] if self._ends else None
+        return self._ends.next_ns()
 
     def _end(self, lane: tuple[str, int]) -> Iterator[Effect]:
         if lane in self.by_lane:
@@ -260,6 +251,7 @@ class StandingLocks:
 
     def _forget(self, lane: tuple[str, int]) -> Standing:
         found = self.by_lane.pop(lane)
+        self._ends.drop(lane)
         self._of[found.owner] -= 1
         if not self._of[found.owner]:
             del self._of[found.owner]

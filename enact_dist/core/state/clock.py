@@ -12,13 +12,15 @@ from __future__ import annotations
 
 import heapq
 from bisect import bisect_left
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
 from enact_dist.core.protocol.messages import Refused
 
 if TYPE_CHECKING:
     from enact_dist.core.protocol.datum import LockId, Position
     from enact_dist.core.protocol.records import Recovered
+
+K = TypeVar("K", str, tuple[str, int])
 
 BOUNDS_S: Final = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 10.0)
 """Upper bounds of the classes, seconds."""
@@ -170,7 +172,7 @@ STALE_MAX: Final = 1024
 """Entries of dropped names that the heap may hold, beside as many as names, before it is swept."""
 
 
-class DueTimes:
+class DueTimes(Generic[K]):
     """Names, each under the earliest time at which it may be due.
 
     A lease that is renewed moves its end with each message, so the ends are corrected lazily: each
@@ -181,16 +183,16 @@ class DueTimes:
     __slots__ = ("_heap", "due")
 
     def __init__(self) -> None:
-        self.due: dict[str, int] = {}
-        self._heap: list[tuple[int, str]] = []
+        self.due: dict[K, int] = {}
+        self._heap: list[tuple[int, K]] = []
 
     def __len__(self) -> int:
         return len(self.due)
 
-    def __contains__(self, name: str) -> bool:
+    def __contains__(self, name: K) -> bool:
         return name in self.due
 
-    def put(self, name: str, due_ns: int) -> None:
+    def put(self, name: K, due_ns: int) -> None:
         """Keep a name, under another time than before if it is here."""
         self.due[name] = due_ns
         heapq.heappush(self._heap, (due_ns, name))
@@ -198,11 +200,11 @@ class DueTimes:
             self._heap = [(due_ns, name) for name, due_ns in self.due.items()]
             heapq.heapify(self._heap)
 
-    def drop(self, name: str) -> None:
+    def drop(self, name: K) -> None:
         """Forget a name, if it is here."""
         self.due.pop(name, None)
 
-    def take(self, until_ns: int) -> list[str]:
+    def take(self, until_ns: int) -> list[K]:
         """Take out the names that may be due by `until_ns`, the earliest first."""
         taken = []
         while self._heap and self._heap[0][0] <= until_ns:

@@ -106,7 +106,7 @@ class Tenures:
         self._sessions = sessions
         self._granted = 0
         self._hold_ends: list[tuple[int, LockId]] = []
-        self._lease_ends = DueTimes()
+        self._lease_ends = DueTimes[str]()
         self._over: dict[str, None] = {}
         self._parked_ends: list[tuple[int, int, LockId]] = []
         self.waiting_of: dict[str, int] = {}

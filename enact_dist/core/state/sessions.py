@@ -181,7 +181,7 @@ class SessionTable:
         now_ns: int,
     ) -> None:
         self.by_id: dict[str, SessionState] = {}
-        self._idle = DueTimes()
+        self._idle = DueTimes[str]()
         self._tokens: dict[tuple[str, str], None] = {}
         self._retired: dict[str, _Retired] = {}
         self._of_identity: dict[str, set[str]] = {}

@@ -254,13 +254,10 @@ class CellClient(SessionClient):
                 if len(calls) == 1 and not self._further.doubted:
                     shard, request = calls[0]
                     timeout_s = request_timeout_s(request)
-                    answers = [
-                        self.carrier.request(shard, request, timeout_s=timeout_s)
-                        if interrupt is None
-                        else self.carrier.request(
-                            shard, request, timeout_s=timeout_s, interrupt=interrupt
-                        )
-                    ]
+                    answer = self.carrier.request(
+                        shard, request, timeout_s=timeout_s, interrupt=interrupt
+                    )
+                    answers = [answer]
                 else:
                     answers = self._send(calls)
                 with self._mutex:

@@ -8,6 +8,7 @@ run from coming to rest.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.client.plan import Phase
@@ -21,8 +22,6 @@ from enact_dist.verify.simulation.hosts.world import MS, S
 from enact_dist.verify.simulation.work.workload import ENTITIES, PLAIN, Job, Workload
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from enact_dist.verify.simulation.hosts.world import SimulatedWorld
     from enact_dist.verify.simulation.judges.history import Entry, Observations
 
@@ -56,7 +55,7 @@ class StandingActors:
                 wait_ns=luck.choice((200 * MS, 2 * S)), hold_ns=60 * S,
                 work_ns=luck.choice((0, 2 * MS, 100 * MS, S)),
                 abandons=False, expects=False,
-                after=(DatumRead(slot, *seen),), gives_up=self._when_over(host, slot, done),
+                after=(DatumRead(slot, *seen),), gives_up=partial(self._is_over, host, slot, done),
             )  # fmt: skip
             if self._world.schedule.begins(job.name):
                 entry = yield from self._workload.do(host, lane, job)
@@ -80,9 +79,6 @@ class StandingActors:
             for one in entry.lock.states
             if one.state.slot == slot
         )
-
-    def _when_over(self, host: ClientNode, slot: Slot, done: tuple[int, int]) -> Callable[[], bool]:
-        return lambda: self._is_over(host, slot, done)
 
     def _is_over(self, host: ClientNode, slot: Slot, done: tuple[int, int]) -> bool:
         """Whether the run winds down, and something was made of the newest datum."""
