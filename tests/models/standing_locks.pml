@@ -2,7 +2,7 @@
  *
  * Each step names what it mirrors in enact_dist/core (file:function):
  *   shard/on_lock.py:on_acquire, _has_news   compared when the request comes
- *   shard/on_lock.py:begin_standing, _enqueue   compared again at each change
+ *   shard/on_lock.py:begin_standing, _admit   compared again at each change
  *   shard/state.py:park, end_slices, drop   the parked request of a lane, and its end
  *   client/lock.py:_acquire, _on_acquiring, release   asked again under the same seq
  *   state/grants.py:take_away   the lease ends
