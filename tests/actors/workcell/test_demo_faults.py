@@ -45,6 +45,8 @@ SECONDS = 300.0
 """Of the scenario: longer than all tests together."""
 LONG_S = 60.0
 """What a busy machine may take for anything; it is no claim."""
+LEAST_S = 8.0
+"""How much of the scenario the truth of a run must cover to say anything."""
 EVERY_CAMERA = [words.camera_entity(number).name for number in range(words.CAMERA_COUNT)]
 LOOK_S = 0.01
 
@@ -107,6 +109,13 @@ class Trial:
             return joints is not None and float(np.abs(joints.dq).max()) == 0.0
 
         self.until("the robot rests", resting)
+
+    def has_played(self) -> bool:
+        """Whether the scenario has been played, and the arm seen, for `LEAST_S`."""
+        truth = self.cell.world("truth")
+        playing = truth.history(words.SCENARIO, words.PLAYING, count=1)[0].datum()
+        joints, _ = self.newest(words.ROBOT, words.JOINTS)
+        return int(joints.stamp_ns[-1]) - playing.start_ns > LEAST_S * 1e9
 
     def actor(self, name: str) -> ActorInfo:
         """Return the session of an actor that runs."""
@@ -284,6 +293,10 @@ def test_the_cell_goes_on_after_its_shard_was_killed(trial: Trial) -> None:
 def test_nothing_of_it_made_the_robot_too_fast(trial: Trial) -> None:
     """On the truth of the whole run, and no command outlived the exposure on which it rests."""
     trial.moves()
+    trial.kill("reconstruction")
+    trial.rests()
+    trial.moves()
+    trial.until("the scenario played for some seconds", trial.has_played)
     trial.recorded.close()
     trace = trace_of(trial.path)
     truth = truth_of(trace)
