@@ -9,7 +9,8 @@ the test starts: a call never takes the other way unnoticed.  `ENACT_TEST_CARRIE
 
 `deploy/test --carrier both` runs all of them over the one, then over the other.
 
-The same seed draws whether actors ask for their locks in advance or watch (`ENACT_STANDING`).
+The same seed draws whether actors ask for their locks in advance or watch (`ENACT_STANDING`), and
+whether grants stay (`ENACT_RETAIN`).  A test about grants that stay has the mark `kept_grants`.
 
 Marks say what else:
 
@@ -58,10 +59,16 @@ def rank(node_id: str) -> bytes:
     return hashlib.blake2b(f"{choice()} of {node_id}".encode(), digest_size=8).digest()
 
 
-def standing(node_id: str) -> str:
-    """Return what `ENACT_STANDING` is for a test: in a quarter of them actors watch their triggers."""
-    digest = hashlib.blake2b(f"{choice()}:{node_id}".encode(), digest_size=2).digest()
-    return "0" if digest[1] < 0x40 else "1"
+def switches(node) -> dict[str, str]:
+    """Return the switches of a test: in a quarter of the tests each of them is off."""
+    _, standing, kept = hashlib.blake2b(
+        f"{choice()}:{node.nodeid}".encode(), digest_size=3
+    ).digest()
+    stays = kept >= 0x40 or node.get_closest_marker("kept_grants")
+    return {
+        "ENACT_STANDING": "0" if standing < 0x40 else "1",
+        "ENACT_RETAIN": "1" if stays else "0",
+    }
 
 
 def ways(node) -> tuple[str, ...]:

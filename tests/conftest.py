@@ -89,7 +89,8 @@ def carrier(request, monkeypatch):
         monkeypatch.setenv("ENACT_CARRIER", way)
     else:  # what a cell.toml says holds
         monkeypatch.delenv("ENACT_CARRIER", raising=False)
-    monkeypatch.setenv("ENACT_STANDING", carriers.standing(request.node.nodeid))
+    for name, value in carriers.switches(request.node).items():
+        monkeypatch.setenv(name, value)
     request.node.user_properties.append(("carrier", way))
     return way
 

@@ -332,6 +332,8 @@ def null_error(
     unknown = ""
     if aspects is not None and slot.aspect not in aspects:
         unknown = f"; no shard knows an aspect {slot.aspect!r}{suggestion(slot.aspect, aspects)}"
+    elif reason == NullReason.DELETED.value:
+        unknown = f": enact why {slot.context} {slot.entity}/{slot.aspect} says by whom"
     return NullDatumError(
         f"{slot.entity}/{slot.aspect} is null in {slot.context} ({reason}{unknown});"
         " use .get(request, default) where that is expected",

@@ -35,6 +35,7 @@ from enact_dist.link.client.dropped import when_dropped
 from enact_dist.terms import FormerNames, checked_name
 from enact_dist.world.context import WorldContext
 from enact_dist.world.forks import drop_world
+from enact_dist.world.invalidation import invalidate
 from enact_dist.world.lineage import CauseTree, EffectTree, tree_of
 from enact_dist.world.listings import (
     ActorInfo,
@@ -295,6 +296,21 @@ class Cell(FormerNames, Closing):
         """
         return tree_of(EffectTree, self._session, (world, entity, aspect), version, depth)
 
+    def invalidate(
+        self, label: str, wrong: Version[Any] | Made, *, wait_s: float = 10.0
+    ) -> tuple[EffectTree, ...]:
+        """Make a wrong version null, and what was made of it; see `world.invalidation`.
+
+        Returns:
+            The versions that were shown until now, and are replaced by null.
+
+        Raises:
+            LockTimeoutError: Their slots stay locked for longer than `wait_s`.
+            ShardUnreachableError: A shard does not answer; the call can be repeated safely.
+        """
+        refuse_inside_lock("invalidate")
+        return invalidate(self._session, label, wrong, wait_s=wait_s)
+
     # ---------------------------------------------------------------- people
 
     def locks(self, shards: Iterable[str] | None = None) -> tuple[LockInfo, ...]:
@@ -394,8 +410,7 @@ class Cell(FormerNames, Closing):
 
     def welcomes(self) -> dict[str, Welcome]:
         """Return how each shard that answers at once describes the cell: placement, contexts."""
-        client = self._client
-        names = client.shards()
+        client, names = self._client, self._client.shards()
         answers = client.call_once([(name, client.core.hello(name)) for name in names])
         pairs = zip(names, answers, strict=True)
         return {name: answer for name, answer in pairs if isinstance(answer, Welcome)}
@@ -419,8 +434,7 @@ class Cell(FormerNames, Closing):
         All shards are asked, because the other may be known to one of them alone; none is waited
         for longer than one call.
         """
-        client = self._client
-        shards = client.shards()
+        client, shards = self._client, self._client.shards()
         answers = client.call_once([(shard, ListSessions()) for shard in shards])
         infos = actor_infos(zip(shards, answers, strict=True))
         return tuple(

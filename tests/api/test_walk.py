@@ -69,6 +69,7 @@ def shard(carrier, tmp_path, monkeypatch):
     running.stop(drain_s=0.0)
 
 
+@pytest.mark.kept_grants
 @pytest.mark.carrier("socket")
 def test_update_enters_few_files(shard):
     """`lock[x] = 3` goes down through the layers and up again, without going back and forth."""

@@ -123,3 +123,33 @@ def test_version_that_cannot_be_read_is_wrong_usage(ask, slot):
     with pytest.raises(SystemExit) as left:
         ask("why", "online", slot)
     assert left.value.code == 2
+
+
+def test_invalidate_shows_first_and_then_writes_null_where_the_wrong_is_shown(ask, cell, enact):
+    """Over two shards; `why` names the label, and the label what was pinned."""
+    online = cell.world("online")
+    source, wrong = Read(online, Entity("lens/0"), SUM), Write(online, Entity("lens/0"), SUM)
+    made = Write(online, Entity("lens/made"), SUM)
+    with Lock(wrong) as lock:
+        lock[wrong] = 7
+    with Lock(source, made) as lock:
+        lock[made] = 8
+    words = ("invalidate", "online", "lens/0/sum", "--label", "bad-lens")
+
+    shown = ask(*words, "--dry-run").out
+    done = ask(*words)
+
+    assert [line.split()[0] for line in shown.splitlines()] == [
+        "online:lens/0/sum",
+        "online:lens/made/sum",
+    ]
+    assert sorted(done.out.splitlines()) == [
+        "online:lens/0/sum v1 is null now",
+        "online:lens/made/sum v1 is null now",
+        "pinned under bad-lens: online:lens/0/sum v1 and what was made of it",
+    ]
+    assert ask("why", "online", "lens/made/sum", "--json").json["actor"] == "invalidate/bad-lens"
+    refused = ask("world", "get", "online", "lens/made/sum")
+    assert (refused.status, "enact why online lens/made/sum" in refused.err) == (1, True)
+    assert len(cell.pinned()["bad-lens"]) == 2
+    assert ask(*words, "--json").status == 1  # the newest is the null: nothing of it was used

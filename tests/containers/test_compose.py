@@ -57,6 +57,26 @@ READ = """read = Read(*slot)
 """A shard that stood still for half a second has its socket tried again, a few seconds later."""
 FAR = READ.replace("range(400)", "range(1)")
 
+COUNTING = """
+import time
+from enact_dist import Aspect, Durability, Entity, Lock, Write, connect
+with connect("/etc/enact/cell.toml", actor="counting") as cell:
+    slot = cell.world("training"), Entity("view/probe"), Aspect("count", int, Durability.VOLATILE)
+    write = Write(*slot)
+    {body}
+"""
+KEEP = """with cell.world("training").watch(*slot[1:]) as news:
+        for number in range(10):
+            with Lock(write) as lock:
+                lock[write] = number
+        while news.next(60.0).version <= 10:
+            pass"""
+"""Counts until its grant stays, and is idle until another process has counted."""
+TAKE = """begun_s = time.monotonic()
+    with Lock(write, wait_s=20.0) as lock:
+        lock[write], taken_s = 10, time.monotonic()
+    print(round(1e3 * (taken_s - begun_s)))"""
+
 
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory):
@@ -131,6 +151,25 @@ def test_large_data_are_shared_between_containers(stack):
     stack.python("feedback", BY_REFERENCE.format(body=WRITE.format(value=1)))
 
     assert stack.python("fusion", BY_REFERENCE.format(body=READ)) == "1 mapped over socket"
+
+
+def test_a_grant_stays_in_a_container_and_goes_when_another_one_asks(stack):
+    """Shard, keeper and taker see the same marks, though each has process numbers of its own."""
+
+    def revoked():
+        return stack.json("shard", "ls")[0]["counters"].get("grants_revoked", 0)
+
+    before, keeper = revoked(), stack.name("feedback")
+    stack.engine.docker("exec", "--detach", keeper, "python", "-c", COUNTING.format(body=KEEP))
+    kept = until(
+        lambda: [one for one in stack.json("lock", "ls") if one["kept"] == "unused"],
+        lambda: stack.enact("lock", "ls"),
+    )
+    taken_ms = int(stack.python("fusion", COUNTING.format(body=TAKE)))
+
+    assert any("view/probe/count" in slot for one in kept for slot in one["slots"])
+    assert revoked() > before
+    assert taken_ms < 1000, "the keeper's lease, or its hold limit, was waited for"
 
 
 def test_with_shared_memory_full_data_travel(stack):

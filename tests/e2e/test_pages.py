@@ -22,6 +22,7 @@ def follow(page, folder):
             reader.does(step)
 
 
+@pytest.mark.kept_grants
 @pytest.mark.carrier("auto")
 @pytest.mark.parametrize("name", ["protocol", "cell", "kept_grants"])
 def test_a_page_does_what_it_says(name, tmp_path):

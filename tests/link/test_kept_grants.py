@@ -20,7 +20,7 @@ from socket_parts import add_one
 
 from enact_dist import Entity, Lock, connect
 
-pytestmark = pytest.mark.carrier("socket", "zenoh")
+pytestmark = [pytest.mark.carrier("socket", "zenoh"), pytest.mark.kept_grants]
 
 KEEPS_AND_ADDS = """
 keep()

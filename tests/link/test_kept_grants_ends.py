@@ -23,7 +23,7 @@ from enact_dist.link.memory import payload_client, use_marks
 from enact_dist.link.memory.use_marks import ClientPage, page_name
 from enact_dist.link.store.store import Store
 
-pytestmark = pytest.mark.carrier("socket", "zenoh")
+pytestmark = [pytest.mark.carrier("socket", "zenoh"), pytest.mark.kept_grants]
 drawn = pytest.mark.carrier("drawn")
 IMAGE = Aspect("image", np.ndarray, Durability.VOLATILE)
 

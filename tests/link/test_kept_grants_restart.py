@@ -10,17 +10,22 @@ from kept_processes import in_thread, keep
 from enact_dist import Aspect, Entity, Lock, Write, connect
 from enact_dist.errors import LeaseLostError
 
+pytestmark = [pytest.mark.slow, pytest.mark.kept_grants]
 
-@pytest.mark.slow
+SESSIONS = 17
+KEPT_EACH = 60
+"""Of 64 at most: 1,020 in all."""
+
+
 def test_shard_killed_with_many_kept_grants_shows_nothing_stale_when_it_is_back(
     process, endpoint, tmp_path, until, monkeypatch, record_property
 ):
     """Nobody who missed the restart is believed, and all locks are free within one TTL."""
     monkeypatch.setenv("ENACT_SESSION_TTL_S", "2")
-    durable, many = Aspect("count", int), [Entity(f"thing/{number}") for number in range(60)]
+    durable, many = Aspect("count", int), [Entity(f"thing/{number}") for number in range(KEPT_EACH)]
     killed = process(endpoint, tmp_path / "data", durability="os")
     with contextlib.ExitStack() as opened:
-        deaf = [opened.enter_context(connect(endpoint, actor=f"deaf{n}")) for n in range(5)]
+        deaf = [opened.enter_context(connect(endpoint, actor=f"deaf{n}")) for n in range(SESSIONS)]
         kept = []
         for number, cell in enumerate(deaf):
             for entity in many:
@@ -37,7 +42,9 @@ def test_shard_killed_with_many_kept_grants_shows_nothing_stale_when_it_is_back(
             with connect(endpoint, actor="new") as new:
                 online = new.world("online")
                 mine = [
-                    Write(online, Entity(f"{e.name}/{n}"), durable) for e in many for n in range(5)
+                    Write(online, Entity(f"{e.name}/{n}"), durable)
+                    for e in many
+                    for n in range(SESSIONS)
                 ]
                 in_thread(take_all, mine, ready_s, record_property)
         for request in kept:

@@ -98,13 +98,13 @@ def missing(
     """Return the error for a datum that is not there."""
     entity, aspect = slot
     reason = reason or NullReason.NEVER_SET.value
-    close = ""
+    remedy = f"enact world tree {world.name} shows what there is"
     if reason == NullReason.NEVER_SET.value:
-        close = suggestion(f"{entity}/{aspect}", _likely(world, entity, aspect))
+        remedy += suggestion(f"{entity}/{aspect}", _likely(world, entity, aspect))
+    elif reason == NullReason.DELETED.value:
+        remedy = f"enact why {world.name} {entity}/{aspect} says by whom"
     return NullDatumError(
-        f"{world.name}:{entity}/{aspect} is null ({reason}); enact world tree"
-        f" {world.name} shows what there is{close}",
-        reason=reason,
+        f"{world.name}:{entity}/{aspect} is null ({reason}); {remedy}", reason=reason
     )
 
 

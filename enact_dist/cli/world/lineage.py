@@ -1,10 +1,10 @@
-"""`enact why` and `enact impact`: where a datum comes from, and what came of it, as trees."""
+"""`enact why`, `impact`, `invalidate`: where a datum comes from, what came of it, its end."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.cli.arguments import READER, WORLD, counted, slot_version
+from enact_dist.cli.arguments import READER, WORLD, counted, seconds_of, slot_version
 from enact_dist.cli.target import open_cell
 from enact_dist.cli.verbs import NOUNS, Option, Output, Verb, flag, option
 from enact_dist.world.trees import ALIKE_MIN, drawn, print_tree
@@ -45,6 +45,19 @@ VERBS: Final = (
         "enact impact training view/milk_carton/0/cloud",
         _options("effects"),
     ),
+    Verb(
+        "invalidate", NOUNS["invalidate"].summary, "invalidate_version",
+        "enact invalidate online camera/3/calibration@12 --label bad-calibration --dry-run\n"
+        "enact invalidate online camera/3/calibration@12 --label bad-calibration",
+        (
+            *_options("effects")[:2],
+            option("--label", "LABEL", "pin all of it until `enact world unpin LABEL`",
+                   required=True),
+            flag("--dry-run", "show the tree of effects, and change nothing"),
+            seconds_of("--wait", "how long to wait for the lock (default: 10)", 10.0),
+            *READER,
+        ),
+    ),
 )  # fmt: skip
 
 
@@ -61,6 +74,20 @@ def show_effects(options: argparse.Namespace) -> Output:
     """Draw the tree of effects of one version."""
     with open_cell(options) as cell:
         return _answer(cell.impact(options.world, *options.slot, depth=options.depth), options)
+
+
+def invalidate_version(options: argparse.Namespace) -> Output:
+    """Pin a version and what was made of it, and replace what is shown of it by null."""
+    if options.dry_run:
+        options.depth, options.all = None, False
+        return show_effects(options)
+    with open_cell(options, observer=False, actor=f"invalidate/{options.label}") as cell:
+        entity, aspect, version = options.slot
+        wrong = cell.why(options.world, entity, aspect, version, depth=0)
+        replaced = cell.invalidate(options.label, wrong, wait_s=options.wait)
+    lines = [f"{one.slot} v{one.version} is null now" for one in replaced]
+    what = f"pinned under {options.label}: {wrong.slot} v{wrong.version} and what was made of it"
+    return Output([facts_of(one) | {"children": []} for one in replaced], "\n".join([*lines, what]))
 
 
 def _answer(tree: Tree, options: argparse.Namespace) -> Output:
