@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import os
 import shutil
 import signal
@@ -30,7 +31,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from enact_dist import Cell
+    from enact_dist.recording import RecordingSummary
 
+_LOG: Final = logging.getLogger("enact.recording")
 LOOKING_ON_NICE: Final = 10
 """Nice value of the threads that record and look on: a tenth of the weight of an actor."""
 UP_S: Final = 60.0
@@ -218,8 +221,8 @@ def recording(
     worlds: Sequence[str] = (),
     aspects: Sequence[str] = (),
     pictures: bool = True,
-) -> Iterator[None]:
-    """Record a cell while the block runs.
+) -> Iterator[RecordingSummary]:
+    """Record a cell while the block runs; its value says what is recorded and what is missing.
 
     Args:
         cell: The cell.
@@ -247,10 +250,13 @@ def recording(
     thread = threading.Thread(target=run, name="recorder", daemon=True)
     thread.start()
     try:
-        yield
+        yield recorder.summary
     finally:
         stop.set()
         thread.join()
+    if missing := recorder.summary.missing:
+        told = ", ".join(f"{count} {why}" for why, count in recorder.summary.gaps.items())
+        _LOG.warning("the recording %s lacks %d versions: %s", path, missing, told)
     if errors:
         raise DemoError(f"the recording {path} failed: {errors[0]}") from errors[0]
 

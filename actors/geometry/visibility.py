@@ -1,8 +1,8 @@
 """What each camera can say about each voxel: tables that are made once per calibration.
 
-A camera can only ever say that a voxel is free.  It has a say if it sees all of the voxel: all of
-its corners lie in the image, at least `NEAREST_M` ahead, and no static obstacle hides one of them;
-corners within an obstacle do not count.
+A camera can only ever say that a voxel is free.  It has a say if it sees all of the voxel: its
+centre and all of its corners lie in the image, at least `NEAREST_M` ahead, and no static obstacle
+hides one of them; corners within an obstacle do not count.
 
 `pixel[v]` is where the camera looks for voxel v: an index into its masks, stored one after another,
 each grown by a different number of pixels.  The mask used is the one grown by the distance in the
@@ -186,8 +186,9 @@ def camera_table(
         good |= inside(box, (x, y, z), 0.0)
     half = np.float32(grid.voxel_m / 2.0)
     u, v, depth = _projected(calibration, x[:-1] + half, y[:, :-1] + half, z[:, :, :-1] + half)
-    say = depth > NEAREST_M
     u, v = np.rint(u), np.rint(v)
+    with np.errstate(invalid="ignore"):  # corners within an obstacle may lie beside the image
+        say = (depth > NEAREST_M) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
     reach = np.zeros(u.shape, np.float32)
     for shift in np.ndindex(2, 2, 2):
         part = tuple(slice(s, s + n) for s, n in zip(shift, grid.shape, strict=True))

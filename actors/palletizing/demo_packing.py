@@ -22,7 +22,7 @@ import contextlib
 import importlib.util
 import sys
 import time
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from actors.geometry.files import write_whole
 from actors.palletizing.controller import ControllerError
@@ -176,7 +176,7 @@ def show_cell(demo: RobotCell | RunningRobotCell, out: Path, *, up: str, keep_ru
     return 0
 
 
-def _recorded(cell: Cell, out: Path, console: Console) -> contextlib.AbstractContextManager[None]:
+def _recorded(cell: Cell, out: Path, console: Console) -> contextlib.AbstractContextManager[Any]:
     """Record the run, if what that takes is installed."""
     if importlib.util.find_spec("mcap") is None:
         console.print("no recording: install the record extra, pip install -e '.[record]'")

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from actors.workcell.demo_options import Options
     from actors.workcell.scenarios import Fault
     from enact_dist import Aspect, Cell, Entity, Version
+    from enact_dist.recording import RecordingSummary
     from enact_dist.world.lineage import CauseTree
 
     Image = npt.NDArray[np.uint8]
@@ -398,7 +399,7 @@ def masks_of(tree: CauseTree) -> list[CauseTree]:
     return sorted(masks, key=lambda cause: str(cause.entity))
 
 
-def recording(cell: Cell, path: Path) -> contextlib.AbstractContextManager[None]:
+def recording(cell: Cell, path: Path) -> contextlib.AbstractContextManager[RecordingSummary]:
     """Record a cell exactly, without messages for viewers, while the block runs.
 
     Args:

@@ -96,6 +96,20 @@ def test_behind_a_box_a_camera_has_no_say_and_above_it_does():
     assert (behind[:, 2] < 0.55).all()
 
 
+def test_beside_its_image_a_camera_has_no_say_even_in_an_obstacle():
+    """Corners within a box do not count; the centre of a voxel that is in it does."""
+    grid, camera = small_grid(), dataclasses.replace(ring(4)[0], width=200, height=140)
+    box = box_row((0.0, 0.0, 0.4), (0.9, 0.9, 0.5))
+    table = camera_table(grid, camera, [box[None]])
+    rows = np.flatnonzero(table.pixel != table.sentinel)
+    local = in_camera(grid.centres(rows).astype(float), camera.camera_from_cell)
+    pixels = on_image(local, camera.camera_matrix, camera.distortion)
+    assert len(rows) > 200
+    assert table.pixel.max() == table.sentinel
+    assert (pixels > -0.51).all()
+    assert (pixels < np.array([200, 140]) - 0.49).all()
+
+
 @pytest.mark.parametrize("yaw_rad", [0.0, 0.4])
 def test_lines_of_sight_against_points_along_them(yaw_rad):
     """A point is hidden exactly if one of 400 points of its line lies in the box."""

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from enact_dist import Cell
+    from enact_dist.recording import RecordingSummary
     from enact_dist.world.listings import ActorInfo, LockInfo
 
 pytestmark = [pytest.mark.timing, pytest.mark.sampled(1, of="faults of an application")]
@@ -59,12 +60,19 @@ class Trial:
         cell: The cell.
         path: The recording of the run.
         recorded: It is whole once this is closed.
+        summary: What it holds, and what it lacks.
     """
 
     def __init__(
-        self, processes: RunningCell, cell: Cell, path: Path, recorded: contextlib.ExitStack
+        self,
+        processes: RunningCell,
+        cell: Cell,
+        path: Path,
+        recorded: contextlib.ExitStack,
+        summary: RecordingSummary,
     ) -> None:
-        self.processes, self.cell, self.path, self.recorded = processes, cell, path, recorded
+        self.processes, self.cell, self.path = processes, cell, path
+        self.recorded, self.summary = recorded, summary
         self.online = cell.world("online")
 
     def newest(self, entity: Entity, aspect: Aspect[T]) -> tuple[T, int]:
@@ -181,8 +189,9 @@ def trial(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Trial]:
     with RunningCell(options) as processes, processes.joined() as cell:
         Conductor(cell, processes, options, print).prepare()
         with contextlib.ExitStack() as recorded:
-            recorded.enter_context(recording(cell, out / "run.mcap"))
-            yield Trial(processes, cell, out / "run.mcap", recorded)
+            path = out / "run.mcap"
+            summary = recorded.enter_context(recording(cell, path))
+            yield Trial(processes, cell, path, recorded, summary)
 
 
 def test_a_frozen_camera_is_named_and_replaced_and_taken_back(trial: Trial) -> None:
@@ -302,6 +311,6 @@ def test_nothing_of_it_made_the_robot_too_fast(trial: Trial) -> None:
     truth = truth_of(trace)
     too_fast = too_fast_of(trace, truth)
 
-    assert len(too_fast) > 500
+    assert len(too_fast) > 500, trial.summary
     assert too_fast.sum() == 0.0
     assert checks_of(trace, {})["at rest within 250 ms and the braking time"]
