@@ -221,6 +221,7 @@ def recording(
     worlds: Sequence[str] = (),
     aspects: Sequence[str] = (),
     pictures: bool = True,
+    gives_way: bool = True,
 ) -> Iterator[RecordingSummary]:
     """Record a cell while the block runs; its value says what is recorded and what is missing.
 
@@ -230,6 +231,7 @@ def recording(
         worlds: Names of the world contexts; all unless given.
         aspects: Names of the aspects; all unless given.
         pictures: Whether viewers such as Foxglove can show it.
+        gives_way: Record only as far as the cell leaves a processor idle.
 
     Raises:
         DemoError: The recording failed.
@@ -241,7 +243,8 @@ def recording(
     stop, errors = threading.Event(), []
 
     def run() -> None:
-        give_way()
+        if gives_way:
+            give_way()
         try:
             recorder.run(stop)
         except (EnactError, OSError) as error:

@@ -399,16 +399,20 @@ def masks_of(tree: CauseTree) -> list[CauseTree]:
     return sorted(masks, key=lambda cause: str(cause.entity))
 
 
-def recording(cell: Cell, path: Path) -> contextlib.AbstractContextManager[RecordingSummary]:
+def recording(
+    cell: Cell, path: Path, *, gives_way: bool = True
+) -> contextlib.AbstractContextManager[RecordingSummary]:
     """Record a cell exactly, without messages for viewers, while the block runs.
 
     Args:
         cell: The cell.
         path: The file; an older one is replaced.
+        gives_way: Record only as far as the cell leaves a processor idle.
 
     Raises:
         DemoError: The recording failed.
     """
+    worlds = ONLINE, TRUTH
     return running_cell.recording(
-        cell, path, worlds=(ONLINE, TRUTH), aspects=RECORDED, pictures=False
+        cell, path, worlds=worlds, aspects=RECORDED, pictures=False, gives_way=gives_way
     )

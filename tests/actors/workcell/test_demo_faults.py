@@ -190,7 +190,7 @@ def trial(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Trial]:
         Conductor(cell, processes, options, print).prepare()
         with contextlib.ExitStack() as recorded:
             path = out / "run.mcap"
-            summary = recorded.enter_context(recording(cell, path))
+            summary = recorded.enter_context(recording(cell, path, gives_way=False))
             yield Trial(processes, cell, path, recorded, summary)
 
 
