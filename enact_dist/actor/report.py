@@ -139,6 +139,8 @@ class ActorStatistics:
         last_error: Newest error as "Class: text", or the empty string.
         rate_hz: Updates per second, over the last 5 s.
         last_update_s: How long the newest update took, without the wait for its lock.
+        update_p50_ms: Median of the same over the newest 512 updates.
+        update_p99_ms: 99th percentile of the same.
         last_update_unix_s: When it ended, seconds since 1970 by the actor's clock; 0 if none.
         lock_wait_p50_ms: Median wait for the lock over the newest 512 attempts.
         lock_wait_p99_ms: 99th percentile of the same.
@@ -189,6 +191,8 @@ class ActorStatistics:
     args: tuple[str, ...] = ()
     words_in: str = ""
     word: str = ""
+    update_p50_ms: float = 0.0
+    update_p99_ms: float = 0.0
 
 
 _NAMES: Final = [field.name for field in dataclasses.fields(ActorStatistics)]
@@ -267,6 +271,7 @@ class ActorRecord:
         self._last_update_ns = self._last_update_unix_ns = 0
         self._rate = RateMeter(start_ns=now_ns)
         self._waits_ns = _Newest(WAITS_MAX)
+        self._updates_ns = _Newest(WAITS_MAX)
 
     def waited(self, wait_ns: int) -> None:
         """Record how long a lock took to be granted or refused."""
@@ -276,6 +281,7 @@ class ActorRecord:
         """Record an update that committed."""
         self._counts["updates"] += 1
         self._last_update_ns = took_ns
+        self._updates_ns.add(took_ns)
         self._last_update_unix_ns = wall_ns
         self._rate.count(now_ns)
 
@@ -296,7 +302,7 @@ class ActorRecord:
 
     def snapshot(self, now_ns: int) -> ActorStatistics:
         """Return what was recorded so far."""
-        waits_ns = self._waits_ns.ascending()
+        waits_ns, updates_ns = self._waits_ns.ascending(), self._updates_ns.ascending()
         return ActorStatistics(
             name=self._name,
             state=self.state,
@@ -308,6 +314,8 @@ class ActorRecord:
             last_update_unix_s=self._last_update_unix_ns / 1e9,
             lock_wait_p50_ms=percentile(waits_ns, 0.50) / 1e6,
             lock_wait_p99_ms=percentile(waits_ns, 0.99) / 1e6,
+            update_p50_ms=percentile(updates_ns, 0.50) / 1e6,
+            update_p99_ms=percentile(updates_ns, 0.99) / 1e6,
         )
 
     def _keep(self, error: BaseException) -> None:

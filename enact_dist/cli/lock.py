@@ -27,7 +27,7 @@ from enact_dist.wire.texts import shown
 from enact_dist.world.trees import shown_s
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Sequence
 
     from enact_dist.core.protocol.messages import Item
     from enact_dist.link.client.locks import CellClient
@@ -62,6 +62,8 @@ def held(text: str) -> tuple[str, str, str, str]:
     return found["world"] or "", entity, aspect, found["access"]
 
 
+LOCK_COLUMNS: Final = ("lock", "shard", "who", "state", "mode", "age", "lease left", "hold left",
+                       "data", "waits for")  # fmt: skip
 VERBS: Final = (
     Verb(
         "ls",
@@ -72,8 +74,7 @@ VERBS: Final = (
         "enact lock ls",
         READER,
         cell=LOOKS,
-        columns=("lock", "shard", "who", "state", "mode", "age", "lease left", "hold left", "data",
-                 "waits for"),
+        columns=LOCK_COLUMNS,
         empty="no lock is held or awaited",
         page="kept_grants",
     ),
@@ -150,8 +151,13 @@ def list_locks(cell: Cell, _options: argparse.Namespace) -> Output:
     """List all locks of the cell, held or awaited; status 3 if a shard does not answer."""
     shards, status = in_reach(cell)
     locks = cell.locks(shards)
+    return Output(locks, rows=lock_rows(locks), status=status)
+
+
+def lock_rows(locks: Sequence[LockInfo]) -> list[tuple[str, ...]]:
+    """Return the rows of a table of locks, each with who holds what it waits for."""
     known = {(lock.shard, lock.number): lock for lock in locks}
-    return Output(locks, rows=[_row(lock, known) for lock in locks], status=status)
+    return [tuple(map(str, _row(lock, known))) for lock in locks]
 
 
 def in_reach(cell: Cell) -> tuple[tuple[str, ...], int]:

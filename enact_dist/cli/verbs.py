@@ -65,6 +65,11 @@ NOUNS: Final = {
     ),
     "replay": Noun("record", "commit a recording into a cell again, at its pace", "recordings"),
     "lock": Noun("lock", "list locks, hold one, break one, resolve one", "guide"),
+    "top": Noun(
+        "top",
+        "show a cell at work: shards, actors, locks and data with their rates, until q",
+        "operations",
+    ),
     "doctor": Noun(
         "doctor",
         "check this machine (libraries, memory, disk), the connection to the cell (shards, clocks),"

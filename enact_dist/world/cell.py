@@ -48,6 +48,7 @@ from enact_dist.world.listings import (
     lock_info,
     shard_info,
 )
+from enact_dist.world.look import Look, look_at
 from enact_dist.world.pins import pin_versions, pinned_versions, unpin_versions
 
 if TYPE_CHECKING:
@@ -407,6 +408,15 @@ class Cell(FormerNames, Closing):
     def shards(self) -> tuple[ShardInfo, ...]:
         """Return every shard of the cell; of an unreachable one with the reason if it is known."""
         return tuple(shard_info(self._client, shard) for shard in self._client.shards())
+
+    def look(self, entities: str = "**", worlds: Iterable[str] = ()) -> Look:
+        """Return what all shards that answer tell of the cell now; none is waited for twice.
+
+        Args:
+            entities: The slots of which entities are listed, as a pattern.
+            worlds: Those of which world contexts; none: of all.
+        """
+        return look_at(self._client, entities, tuple(worlds))
 
     def welcomes(self) -> dict[str, Welcome]:
         """Return how each shard that answers at once describes the cell: placement, contexts."""

@@ -319,10 +319,17 @@ def _asked_info(client: CellClient, shard: str) -> ShardInfo:
     round_trip_s = time.monotonic() - started_s
     if not isinstance(answer, Sessions):
         return ShardInfo(shard, endpoint, reachable=False)
+    return answered_info(client, shard, answer, round_trip_s)
+
+
+def answered_info(
+    client: CellClient, shard: str, answer: Sessions, round_trip_s: float
+) -> ShardInfo:
+    """Return what the answer of a shard tells about it; the call took `round_trip_s`."""
     ahead_ns = answer.wall_ns - time.time_ns() + round_trip_s * 1e9 / 2
     return ShardInfo(
         shard,
-        endpoint,
+        client.carrier.endpoint_of(shard),
         reachable=True,
         epoch=answer.epoch,
         open=answer.open,
