@@ -104,6 +104,7 @@ def test_record_counts_each_ending_of_an_update_apart():
     assert found.last_update_s == pytest.approx(0.03)
     assert found.last_update_unix_s == pytest.approx(5.0)
     assert found.lock_wait_p50_ms == pytest.approx(2.0)
+    assert (found.update_p50_ms, found.update_p99_ms) == pytest.approx((30.0, 30.0))
 
 
 def test_reports_come_back_equal_when_encoded_and_decoded():

@@ -47,10 +47,8 @@ class TopApp(App[None]):
     DataTable { height: 1fr; border: round $primary; }
     DataTable:focus { border: round $accent; }
     #panel-s { height: auto; max-height: 30%; }
-    #panel-c { display: none; }
+    #panel-s.alone { height: 1fr; max-height: 100%; }
     #filter { display: none; dock: bottom; }
-    .alone #panel-s, .alone #panel-a, .alone #panel-l, .alone #panel-d { display: none; }
-    .alone DataTable.chosen { display: block; height: 1fr; max-height: 100%; }
     #events { height: auto; color: $text-muted; }
     #away { height: auto; color: $text-error; }
     """
@@ -118,7 +116,7 @@ class TopApp(App[None]):
         """Begin to look."""
         for table in TABLES:
             self._draw_columns(table)
-        self.query_one("#panel-a").focus()
+        self._arrange()
         self._draw()
         self.run_worker(self._look_on, thread=True)
 
@@ -153,18 +151,28 @@ class TopApp(App[None]):
     def action_panel(self, key: str) -> None:
         """Show one panel alone, or all again."""
         self._alone = "" if self._alone == key else key
-        self.screen.set_class(bool(self._alone), "alone")
-        for table in TABLES:
-            self._panel(table).set_class(table.key == self._alone, "chosen")
-        self.query_one(f"#panel-{self._alone or 'a'}").focus()
+        self._arrange()
         self._draw()
+
+    def _arrange(self) -> None:
+        """Show the panels that are to be seen: one alone, or all but the counters."""
+        for table in TABLES:
+            panel, alone = self._panel(table), table.key == self._alone
+            panel.display = alone if self._alone else table.key != "c"
+            panel.set_class(alone, "alone")
+        self._panel_in_use().focus()
+
+    def _panel_in_use(self) -> DataTable[Text]:
+        return self.query_one(f"#panel-{self._alone or 'a'}", DataTable)
 
     def action_all(self) -> None:
         """Show all panels and all rows."""
         self._only = ""
         self.query_one(Input).value = ""
+        self._alone = ""
         self._hide_filter()
-        self.action_panel(self._alone)
+        self._arrange()
+        self._draw()
 
     def action_filter(self) -> None:
         """Ask for a text that rows must have."""
@@ -183,7 +191,7 @@ class TopApp(App[None]):
 
     def _hide_filter(self) -> None:
         self.query_one(Input).display = False
-        self.query_one(f"#panel-{self._alone or 'a'}").focus()
+        self._panel_in_use().focus()
 
     def action_next_column(self) -> None:
         """Sort the panel in use by its next column."""
