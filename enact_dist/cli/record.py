@@ -11,14 +11,27 @@ from enact_dist.cli.arguments import (
     COMPRESSIONS,
     ENTITIES,
     TIMEOUT,
+    one_entity,
     pair,
     pairs,
     seconds,
+    tolerance,
 )
 from enact_dist.cli.target import cell_target, is_endpoint, open_cell
 from enact_dist.cli.text.output import ProgressLine, print_json, shown_bytes
 from enact_dist.cli.text.times import MOMENT_HELP, moment
-from enact_dist.cli.verbs import DONE, FAILED, NOUNS, Verb, flag, many, option
+from enact_dist.cli.verbs import (
+    DONE,
+    FAILED,
+    NOUNS,
+    Option,
+    OptionGroup,
+    Verb,
+    flag,
+    many,
+    option,
+)
+from enact_dist.errors import ConfigError
 from enact_dist.link.signals import StopSignals
 from enact_dist.world.trees import shown_s
 
@@ -39,6 +52,34 @@ def world_choice(text: str) -> tuple[str, str]:
 
 
 _SUMMARY: Final = (flag("--json", "print the summary as JSON"), TIMEOUT)
+
+_STEP: Final = OptionGroup(
+    "one step of an actor",
+    (
+        Option(("--step",), {
+            "nargs": 2, "metavar": ("WORLD", "ENTITY/ASPECT[@VERSION]"),
+            "help": "run the step again that made this version (default: the newest), on what its"
+                    " commit had read, and compare what it writes",
+        }),
+        option("--actor", "MODULE:CLASS", "the actor that runs"),
+        option("--name", "NAME",
+               "take options, world contexts and entity, and the class unless --actor names one,"
+               " of this actor in cell.toml", default=""),
+        many("--option", "KEY=VALUE", "argument of the class", type=pair),
+        option("--entity", "NAME", "the entity that triggered it, or the one that it works on",
+               type=one_entity),
+        many("--tolerance", "[ASPECT=]X",
+             "how far numbers may be apart: 0.5, 1%%, shift_mm=0.5", type=tolerance, default=[]),
+        option("--keep-as", "NAME",
+               "keep the world context of the step, else it is dropped; of several, each is called"
+               " NAME-WORLD", default=""),
+    ),
+    """\
+The step runs in world contexts of its own and writes no other.  Its code is not
+kept from anything else: start, update and stop of an actor that moves a machine,
+writes a file or sends a message do so again.  --world ROLE=NAME binds a role.
+Status 0 if it writes the same, 4 if not, 1 if it raises.""",
+)  # fmt: skip
 
 VERBS: Final = (
     Verb(
@@ -66,12 +107,15 @@ VERBS: Final = (
         "replay", NOUNS["replay"].summary, "run_replay",
         "enact replay run.mcap --speed 0.5 --into cell.toml --world online=replayed\n"
         "enact replay run.mcap --speed 0 --from 10 --to 20\n"
-        "enact replay run.mcap --world online --entities 'camera/*' --aspect image",
+        "enact replay run.mcap --world online --entities 'camera/*' --aspect image\n"
+        "enact replay --step online system/deviation@12 --actor my_actors:Deviation\n"
+        "enact replay --step online system/deviation --name deviation --keep-as tried",
         (
-            option("file", "FILE", "a recording"),
-            option("--into", "CELL",
-                   "a cell.toml or an endpoint (default: $ENACT_CELL, else ./cell.toml)",
-                   dest="cell"),
+            option("file", "FILE", "a recording", nargs="?"),
+            Option(("--into", "--cell"), {
+                "metavar": "CELL", "dest": "cell",
+                "help": "a cell.toml or an endpoint (default: $ENACT_CELL, else ./cell.toml)",
+            }),
             option("--speed", "S", "0: as fast as possible (default: 1)", type=float, default=1.0),
             many("--world", "NAME|OLD=NEW",
                  "replay only this context (repeat it for several); OLD=NEW writes the recorded"
@@ -85,6 +129,7 @@ VERBS: Final = (
             flag("--loop", "start again at the end, until Ctrl-C"),
             flag("--overwrite", "also write into contexts that have data"),
             *_SUMMARY,
+            _STEP,
         ),
     ),
 )  # fmt: skip
@@ -160,7 +205,17 @@ def _recorded_line(summary: RecordingSummary) -> str:
 
 
 def run_replay(options: argparse.Namespace) -> int:
-    """Commit a recording again until its end or a signal; fail where nothing in it was chosen."""
+    """Commit a recording again until its end or a signal; fail where nothing in it was chosen.
+
+    Raises:
+        ConfigError: Neither a recording nor a step is named, or both.
+    """
+    if (options.file is None) == (options.step is None):
+        raise ConfigError("name either a recording or --step WORLD ENTITY/ASPECT@VERSION")
+    if options.step is not None:
+        from enact_dist.cli.step import run_step
+
+        return run_step(options)
     from enact_dist.recording import Replay
 
     def warn(text: str) -> None:

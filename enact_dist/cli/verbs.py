@@ -63,7 +63,11 @@ NOUNS: Final = {
         "record every version of a cell's data into an MCAP file until Ctrl-C",
         "recordings",
     ),
-    "replay": Noun("record", "commit a recording into a cell again, at its pace", "recordings"),
+    "replay": Noun(
+        "record",
+        "commit a recording into a cell again, at its pace; or run one step of an actor again",
+        "recordings",
+    ),
     "lock": Noun("lock", "list locks, hold one, break one, resolve one", "guide"),
     "top": Noun(
         "top",

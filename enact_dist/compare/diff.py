@@ -145,9 +145,29 @@ def diff(
         aspects = checked_each(call, "aspects", aspects, Aspect, str)
     types = aspects_of((left, right), aspects)
     places = [(str(Entities(str(entities))), name) for name in types]
+    return diff_places(left, right, places, types, each=True)
+
+
+def diff_places(
+    left: Viewable,
+    right: Viewable,
+    places: Sequence[Place],
+    types: Mapping[str, Aspect[Any]],
+    *,
+    each: bool = False,
+) -> Diff:
+    """Compare some slots of two world contexts.
+
+    Args:
+        left: One world context.
+        right: The other one.
+        places: The slots: entities (patterns with `each`) and aspects.
+        types: The aspects by name.
+        each: Whether the entities are patterns.
+    """
 
     def compare() -> Diff:
-        with both_sides(left, right, places, each=True) as (first, second):
+        with both_sides(left, right, places, each=each) as (first, second):
             pairs = pairs_of(first.of(left.name), second.of(right.name))
             return _counted(left.name, right.name, compared(pairs, first, second, types))
 

@@ -11,24 +11,24 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.access.writes import Writing
 from enact_dist.config.table import suggestion
 from enact_dist.core.protocol.datum_types import succeeds, type_conflict
-from enact_dist.core.protocol.messages import AspectEntry, Item
+from enact_dist.core.protocol.messages import AspectEntry
 from enact_dist.errors import ConfigError, DatumTypeError, MisuseError
 from enact_dist.patterns import pattern_matches
 from enact_dist.recording.other_writers import OtherWriters
 from enact_dist.recording.reading import RecordedCommit, Recording
-from enact_dist.terms import Access, Entities, checked_name
+from enact_dist.terms import Entities, checked_name
 from enact_dist.wire.limits import BODY_BYTES_MAX, ITEMS_MAX
-from enact_dist.wire.payload import Encoded
+from enact_dist.world.version_data import set_encoded
 
 if TYPE_CHECKING:
     import os
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from enact_dist.access.session import Session
-    from enact_dist.core.protocol.datum import Datum, Slot
+    from enact_dist.core.client.lock import MultiLock
+    from enact_dist.core.protocol.datum import Slot
     from enact_dist.recording.exact import Recorded
     from enact_dist.world.cell import Cell
     from enact_dist.world.context import WorldContext
@@ -259,31 +259,19 @@ class Replay:
 
     def _commit(self, versions: Sequence[Recorded]) -> None:
         """Commit data under one lock."""
-        slots = [self._slot(recorded.slot) for recorded in versions]
+        data = {self._slot(recorded.slot): recorded.datum for recorded in versions}
         session = next(iter(self._sessions.values()))
-        client = session.client
-        prepared = client.catalogue.lapses
+        prepared = session.client.catalogue.lapses
         self._register(session, versions)
-        items = [Item(int(Access.WRITE), *slot) for slot in slots]
-        writing = Writing(client.payloads)
-        lock = client.acquire(items, wait_s=WAIT_S, hold_s=HOLD_S)
-        self._others.look_at(session, lock)
-        committed = False
-        try:
-            if client.catalogue.lapses != prepared:  # a shard has restarted and forgotten an aspect
+
+        def granted(lock: MultiLock) -> None:
+            self._others.look_at(session, lock)
+            if session.client.catalogue.lapses != prepared:  # a restarted shard forgot an aspect
                 self._registered.clear()
                 self._register(session, versions)
-            for slot, recorded in zip(slots, versions, strict=True):
-                if recorded.datum is None:
-                    writing.delete(slot)
-                else:
-                    writing.put(slot, _encoded(recorded.datum), lock.shard_of)
-            client.finish(lock, writing.by_shard(lock.shard_of))
-            committed = True
-            self._others.committed(lock)
-        finally:
-            client.release(lock)
-            writing.end(committed=committed)
+
+        lock = set_encoded(session.client, data, wait_s=WAIT_S, hold_s=HOLD_S, granted=granted)
+        self._others.committed(lock)
         self.summary.versions += len(versions)
 
     def _slot(self, slot: Slot) -> Slot:
@@ -379,10 +367,6 @@ def _as_known(entry: AspectEntry, known: AspectEntry | None) -> AspectEntry:
         return entry
     older = succeeds(known.fingerprint, entry.fingerprint)
     return entry._replace(durability="", reads=older)
-
-
-def _encoded(datum: Datum) -> Encoded:
-    return Encoded(datum.encoding, [datum.body], datum.size, datum.stamp_ns)
 
 
 def _parts(versions: Sequence[Recorded]) -> Iterator[Sequence[Recorded]]:

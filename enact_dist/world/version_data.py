@@ -1,4 +1,4 @@
-"""The data of given versions, read from their shards as long as these retain them.
+"""The data of given versions, read from their shards as long as these retain them, and set again.
 
 A datum is read by a view as of its timestamp: shards show what is retained, and what was replaced
 within the last 2 s.  As of the largest timestamp of a batch each slot shows its newest version of
@@ -12,16 +12,20 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from enact_dist.access import asking
 from enact_dist.access.snapshot import HeldView
+from enact_dist.access.writes import Writing
 from enact_dist.core.protocol.messages import Item, SlotVersion
 from enact_dist.errors import ForgottenError, LeaseLostError
 from enact_dist.terms import Access
+from enact_dist.wire.payload import Encoded
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from enact_dist.access.session import Session
+    from enact_dist.core.client.lock import MultiLock
     from enact_dist.core.protocol.datum import Datum, Slot
     from enact_dist.core.protocol.messages import VersionEntry
+    from enact_dist.link.client.locks import CellClient
 
 
 class Wanted(NamedTuple):
@@ -111,3 +115,42 @@ def _as_of(session: Session, wanted: Sequence[Wanted], at_ns: int) -> dict[Wante
             each: Retained(reading.state.null_reason, data.get(each.slot))
             for each, reading in readings.items()
         }
+
+
+def set_encoded(
+    client: CellClient,
+    data: Mapping[Slot, Datum | None],
+    *,
+    wait_s: float,
+    hold_s: float,
+    granted: Callable[[MultiLock], None] = lambda _: None,
+) -> MultiLock:
+    """Commit encoded data under one lock, as they are: no type has to be known here.
+
+    Args:
+        client: The client; its shards know the aspects.
+        data: What each slot is set to; None: null.  No more than one lock may write.
+        wait_s: How long to wait for the lock.
+        hold_s: How long it may be held.
+        granted: Called once it is held.
+
+    Returns:
+        The lock, which is over.
+    """
+    writing, committed = Writing(client.payloads), False
+    items = [Item(int(Access.WRITE), *slot) for slot in data]
+    lock = client.acquire(items, wait_s=wait_s, hold_s=hold_s)
+    try:
+        granted(lock)
+        for slot, datum in data.items():
+            if datum is None:
+                writing.delete(slot)
+            else:
+                encoded = Encoded(datum.encoding, [datum.body], datum.size, datum.stamp_ns)
+                writing.put(slot, encoded, lock.shard_of)
+        client.finish(lock, writing.by_shard(lock.shard_of))
+        committed = True
+    finally:
+        client.release(lock)
+        writing.end(committed=committed)
+    return lock

@@ -228,7 +228,7 @@ def _process(options: argparse.Namespace) -> ActorProcess | None:
                 f"{suggestion(options.process, known)} (known: {_listed(known)})"
             )
     else:
-        actors = [_entry(config, target) for target in targets]
+        actors = [actor_entry(config, target) for target in targets]
     _refuse_of_one(options, actors)
     (process, *others) = processes_of(actors)
     if len(actors) > 1 and others:
@@ -262,7 +262,12 @@ def _refuse_other_variables(process: ActorProcess) -> None:
                 )
 
 
-def _entry(config: CellConfig, name: str) -> ActorConfig:
+def actor_entry(config: CellConfig, name: str) -> ActorConfig:
+    """Return the table of an actor in `cell.toml`.
+
+    Raises:
+        ConfigError: There is none of that name.
+    """
     for entry in config.actors:
         if entry.name == name:
             return entry
@@ -291,13 +296,13 @@ def _made(options: argparse.Namespace, target: str, *, begun: bool = False) -> _
     given = pairs(options.option, "--option")
     drain_s = DRAIN_S if options.drain_s is None else options.drain_s
     if ":" in target:
-        see_modules(_cell_file(options))
+        see_modules(cell_file(options))
         actor = load_actor(target, given)
         name = ""
     else:
         config = cell_config(options)
         see_modules(config.path)
-        entry = _entry(config, target)
+        entry = actor_entry(config, target)
         if given:
             raise ConfigError(f"the options of {entry.name} stand in {config.path}; leave --option")
         if not begun:
@@ -335,7 +340,7 @@ def _begin_with(env: Mapping[str, str]) -> None:
         os.execve(command[0], command, {**os.environ, **env})  # noqa: S606 - itself
 
 
-def _cell_file(options: argparse.Namespace) -> Path | None:
+def cell_file(options: argparse.Namespace) -> Path | None:
     """Return the cell.toml that the command names; None where it names an endpoint, or nothing."""
     try:
         target = cell_target(options)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from enact_dist.operate.cell_rows import ActorRates, CellRates, DatumRates, ShardRates
 
 
-class Column(NamedTuple):
+class TopColumn(NamedTuple):
     """One column.
 
     Attributes:
@@ -47,7 +47,7 @@ class TopTable:
 
     key: str
     title: str
-    columns: tuple[Column, ...]
+    columns: tuple[TopColumn, ...]
     rows: Callable[[CellRates], Sequence[Any]]
     first: int
     empty: str
@@ -91,14 +91,14 @@ def _ago(value: float | None) -> str:
     return "-" if value is None else f"{shown_s(value)} ago"
 
 
-def _name(name: str, attribute: str) -> Column:
+def _name(name: str, attribute: str) -> TopColumn:
     value = attrgetter(attribute)
-    return Column(name, lambda row: str(value(row)), value, falls=False)
+    return TopColumn(name, lambda row: str(value(row)), value, falls=False)
 
 
-def _figure(name: str, attribute: str, text: Callable[[Any], str] = str) -> Column:
+def _figure(name: str, attribute: str, text: Callable[[Any], str] = str) -> TopColumn:
     value = attrgetter(attribute)
-    return Column(name, lambda row: text(value(row)), value)
+    return TopColumn(name, lambda row: text(value(row)), value)
 
 
 # ---------------------------------------------------------------- shards, counters
@@ -125,7 +125,7 @@ _SHARDS: Final = TopTable(
     "shards",
     (
         _name("shard", "name"),
-        Column("state", _shard_state, _shard_state, falls=False),
+        TopColumn("state", _shard_state, _shard_state, falls=False),
         _figure("up", "uptime_s", shown_s),
         _figure("commits", "commits_hz", _per_s),
         _figure("written", "written_bytes_s", _bytes_s),
@@ -135,9 +135,9 @@ _SHARDS: Final = TopTable(
         _figure("wait p99", "lock_wait_p99_ms", _ms),
         _figure("held", "locks_held"),
         _figure("waiting", "locks_waiting"),
-        Column("shared memory", _shared, attrgetter("shared_bytes")),
+        TopColumn("shared memory", _shared, attrgetter("shared_bytes")),
         _figure("sessions", "sessions"),
-        Column("leases left", _leases, attrgetter("sessions")),
+        TopColumn("leases left", _leases, attrgetter("sessions")),
         _figure("slots", "slots"),
     ),
     lambda rates: rates.shards,
@@ -154,7 +154,7 @@ _COUNTERS: Final = TopTable(
         _figure("now", "hz", _per_s),
         _figure("since begin", "moved"),
         _figure("total", "total"),
-        Column("what to do", lambda row: row.remedy or "-", lambda row: row.remedy or None,
+        TopColumn("what to do", lambda row: row.remedy or "-", lambda row: row.remedy or None,
                falls=False),
         _name("meaning", "meaning"),
     ),
@@ -175,7 +175,7 @@ _ACTORS: Final = TopTable(
     "actors",
     (
         _name("actor", "name"),
-        Column("state", _state, _state, falls=False),
+        TopColumn("state", _state, _state, falls=False),
         _figure("runs", "runs_hz", _per_s),
         _figure("update p50", "update_p50_ms", _ms),
         _figure("update p99", "update_p99_ms", _ms),
@@ -189,8 +189,8 @@ _ACTORS: Final = TopTable(
         _figure("lease left", "lease_left_s", lambda left_s: shown_s(max(0.0, left_s))),
         _name("host", "host"),
         _figure("pid", "pid"),
-        Column("last error", lambda row: row.last_error or "-", lambda row: row.last_error or None,
-               falls=False),
+        TopColumn("last error", lambda row: row.last_error or "-",
+                  lambda row: row.last_error or None, falls=False),
     ),
     lambda rates: rates.actors,
     0,
@@ -205,12 +205,12 @@ _LOCK_VALUES: Final = {
 }  # fmt: skip
 
 
-def _lock_column(index: int, name: str) -> Column:
+def _lock_column(index: int, name: str) -> TopColumn:
     text = itemgetter(index)
     if name in _LOCK_VALUES:
         value = attrgetter(_LOCK_VALUES[name])
-        return Column(name, lambda row: text(row[1]), lambda row: value(row[0]))
-    return Column(name, lambda row: text(row[1]), lambda row: text(row[1]), falls=False)
+        return TopColumn(name, lambda row: text(row[1]), lambda row: value(row[0]))
+    return TopColumn(name, lambda row: text(row[1]), lambda row: text(row[1]), falls=False)
 
 
 _LOCKS: Final = TopTable(
@@ -233,12 +233,12 @@ _DATA: Final = TopTable(
     "d",
     "data",
     (
-        Column("datum", _datum, _datum, falls=False),
+        TopColumn("datum", _datum, _datum, falls=False),
         _figure("rate", "hz", _per_s),
         _figure("bandwidth", "bytes_s", _bytes_s),
         _figure("size", "size_bytes", lambda size: shown_bytes(size) if size else "-"),
-        Column("version", lambda row: f"v{row.version}", attrgetter("version")),
-        Column("age", lambda row: f"NULL ({row.null_reason})" if row.null_reason
+        TopColumn("version", lambda row: f"v{row.version}", attrgetter("version")),
+        TopColumn("age", lambda row: f"NULL ({row.null_reason})" if row.null_reason
                else shown_s(row.age_s), attrgetter("age_s"), falls=False),
         _name("shard", "shard"),
     ),

@@ -44,7 +44,7 @@ def show_diff(options: argparse.Namespace) -> Output:
         right = _context(cell, options.right, options.at2)
         aspects = _aspects(options, cell, configured)
         found = left.diff(right, options.entities, aspects)
-    show = partial(_print_diff, found, every=options.all)
+    show = partial(print_diff, found, every=options.all)
     return Output(found.to_json, show, status=DIFFERENT if found else DONE)
 
 
@@ -153,7 +153,8 @@ def _aspects(
 # ---------------------------------------------------------------- the table
 
 
-def _print_diff(found: Diff, *, every: bool) -> None:
+def print_diff(found: Diff, *, every: bool) -> None:
+    """Print how two world contexts differ, slot by slot; without `every`, few of one side alone."""
     changed = [row for row in found if row.left is not None and row.right is not None]
     left = [row for row in found if row.right is None]
     right = [row for row in found if row.left is None]
