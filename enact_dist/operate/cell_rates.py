@@ -1,18 +1,21 @@
-"""Rates of a cell from two looks at it: pure, no clock and no connection; `enact top` shows them.
+"""Rates of a cell from two looks at it; `enact top` shows them.
 
 A rate is the difference of two figures of a shard, divided by the time that passed on that shard's
 own clock between them.  So a look that came late, or a shard that stood still, makes no rate
 wrong.  A shard that has restarted counts from its start.
 
-`Looks` also notes what two looks alone do not show: since when a shard is away, how often an actor
-has restarted, and which counters have moved since the first look.
+`Looks` is pure: no clock and no connection.  It also notes what two looks alone do not show: since
+when a shard is away, how often an actor has restarted, and which counters have moved since the
+first look.
 """
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from typing import TYPE_CHECKING, Any, Final
 
+from enact_dist.core.protocol.messages import Survey
 from enact_dist.core.state.clock import state_of
 from enact_dist.link.daemon.counters import OF_A_SHARD
 from enact_dist.operate.cell_rows import (
@@ -27,6 +30,9 @@ from enact_dist.patterns import pattern_matches
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
+    from enact_dist.access.snapshot import SlotInfo
+    from enact_dist.core.protocol.datum import Slot
+    from enact_dist.world.cell import Cell
     from enact_dist.world.listings import ActorInfo, ShardInfo
     from enact_dist.world.look import Look
 
@@ -44,11 +50,39 @@ def pause_s(every_s: float, took_s: float) -> float:
     return max(every_s - took_s, took_s / SHARE_OF_TIME - took_s, 0.0)
 
 
+class CellLooks:
+    """Looks at a cell again and again; at its slots only as often as they cost little.
+
+    Args:
+        cell: The cell; an observer will do.
+        entities: The slots of which entities are looked at, as a pattern.
+        worlds: Those of which world contexts; none: of all.
+    """
+
+    def __init__(self, cell: Cell, entities: str = "**", worlds: Iterable[str] = ()) -> None:
+        self._cell = cell
+        self._survey = Survey(tuple(worlds), (entities,), ())
+        self._looks = Looks()
+        self._slots_due_s = 0.0
+
+    def take(self, *, slots: bool = False) -> CellRates:
+        """Take a look, at the slots if they are due or asked for; return the rates since then."""
+        due = slots or time.monotonic() >= self._slots_due_s
+        look = self._cell.look(self._survey if due else None)
+        if due:
+            wait_s = look.slots_took_s / SHARE_OF_TIME
+            self._slots_due_s = time.monotonic() + wait_s
+        return self._looks.add(look)
+
+
 class Looks:
-    """Looks at one cell, one after another."""
+    """Looks at one cell, one after another: what they show together."""
 
     def __init__(self) -> None:
         self._last: Look | None = None
+        self._slots: Mapping[Slot, SlotInfo] = {}
+        self._slots_of: dict[str, ShardInfo] = {}
+        self._rows: tuple[DatumRates, ...] = ()
         self._shards: dict[str, ShardInfo] = {}
         self._first: dict[str, tuple[int, Mapping[str, int]]] = {}
         self._away_unix_s: dict[str, float] = {}
@@ -63,6 +97,7 @@ class Looks:
             for shard in look.shards
             if shard.reachable
         }
+        self._note_slots(look)
         for shard in look.shards:
             self._note_shard(shard, look.unix_s)
         self._note_actors(look)
@@ -74,7 +109,7 @@ class Looks:
             tuple(sorted(self._counters(look, spans_s), key=lambda one: not one.remedy)),
             tuple(self._actors(look)),
             look.locks,
-            tuple(self._data(look, spans_s)),
+            self._rows,
             tuple(self._events),
         )
         self._shards.update({shard.name: shard for shard in look.shards if shard.reachable})
@@ -100,6 +135,16 @@ class Looks:
         if restarted or name not in self._first:
             counts = {} if restarted else shard.counters
             self._first[name] = shard.epoch, counts
+
+    def _note_slots(self, look: Look) -> None:
+        """Compare the slots with those of the look before that asked for them, if this one did."""
+        if look.slots is None:
+            return
+        shards = {shard.name: shard for shard in look.shards if shard.reachable}
+        spans_s = {name: _span_s(self._slots_of.get(name), one) for name, one in shards.items()}
+        self._rows = tuple(self._data(look, look.slots, spans_s))
+        self._slots = look.slots
+        self._slots_of.update(shards)
 
     def _note_actors(self, look: Look) -> None:
         for info in look.actors:
@@ -173,7 +218,7 @@ class Looks:
                     )
 
     def _actors(self, look: Look) -> Iterator[ActorRates]:
-        written = _Written(look)
+        written = _Written(look.unix_s, self._slots)
         for info in look.actors:
             reports = _reports(info)
             session: dict[str, Any] = {
@@ -198,10 +243,11 @@ class Looks:
                     **session,
                 )
 
-    def _data(self, look: Look, spans_s: Mapping[str, float | None]) -> Iterator[DatumRates]:
-        before = self._last.slots if self._last is not None else {}
-        for slot, info in sorted(look.slots.items()):
-            old, span_s, hz = before.get(slot), spans_s.get(info.shard), None
+    def _data(
+        self, look: Look, slots: Mapping[Slot, SlotInfo], spans_s: Mapping[str, float | None]
+    ) -> Iterator[DatumRates]:
+        for slot, info in sorted(slots.items()):
+            old, span_s, hz = self._slots.get(slot), spans_s.get(info.shard), None
             if old is not None and span_s:
                 hz = max(info.version - old.version, 0) / span_s
             yield DatumRates(
@@ -260,10 +306,10 @@ def _largest(reports: Iterable[Mapping[str, Any]], name: str) -> float:
 class _Written:
     """The newest commit of each aspect's slots, found by what an actor declares to write."""
 
-    def __init__(self, look: Look) -> None:
-        self._unix_s = look.unix_s
+    def __init__(self, unix_s: float, slots: Mapping[Slot, SlotInfo]) -> None:
+        self._unix_s = unix_s
         self._stamps_ns: dict[tuple[str, str], dict[str, int]] = {}
-        for slot, info in look.slots.items():
+        for slot, info in slots.items():
             if not info.null_reason:
                 stamps_ns = self._stamps_ns.setdefault((slot.context, slot.aspect), {})
                 stamps_ns[slot.entity] = info.position.stamp_ns

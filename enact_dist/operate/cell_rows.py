@@ -169,12 +169,12 @@ class CellRates:
     Attributes:
         unix_s: When the second one was taken, seconds since 1970.
         seconds: How long after the first one; 0 if there was none.
-        took_s: How long the second one took.
+        took_s: How long the second one took, its slots left out.
         shards: All shards, those away too.
         counters: The counters that have moved, those with a remedy first.
         actors: The actors, by name.
         locks: Locks held, awaited and kept.
-        data: The slots.
+        data: The slots, as of the newest look that asked for them.
         events: What happened to shards and actors since the first look: when (seconds since 1970),
             and what.
     """

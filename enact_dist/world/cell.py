@@ -28,6 +28,7 @@ from enact_dist.core.protocol.messages import (
     ListSessions,
     Locks,
     Sessions,
+    Survey,
     Welcome,
 )
 from enact_dist.errors import EnactError, MisuseError
@@ -409,14 +410,12 @@ class Cell(FormerNames, Closing):
         """Return every shard of the cell; of an unreachable one with the reason if it is known."""
         return tuple(shard_info(self._client, shard) for shard in self._client.shards())
 
-    def look(self, entities: str = "**", worlds: Iterable[str] = ()) -> Look:
-        """Return what all shards that answer tell of the cell now; none is waited for twice.
+    def look(self, slots: Survey | None = None) -> Look:
+        """Return what all shards that answer tell of the cell now, `slots` too if they are asked.
 
-        Args:
-            entities: The slots of which entities are listed, as a pattern.
-            worlds: Those of which world contexts; none: of all.
+        A shard that does not answer is one that is not `reachable`; no error is raised for it.
         """
-        return look_at(self._client, entities, tuple(worlds))
+        return look_at(self._client, slots)
 
     def welcomes(self) -> dict[str, Welcome]:
         """Return how each shard that answers at once describes the cell: placement, contexts."""

@@ -1,14 +1,14 @@
 """One look at a whole cell: its shards, actors, locks and slots, from the shards that answer.
 
-A look asks each shard three questions at once, each once.  A shard that does not answer in time is
-described as not reachable, and its part is missing; nothing waits for it a second time.  A shard
+A look asks each shard for its sessions and locks at once, and then for its slots, each once.  A
+shard that does not answer in time is described as not reachable, and its part is missing.  A shard
 answers listings in pages, between which it serves others, so a look at a large cell delays no lock.
 """
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from enact_dist.access.snapshot import slot_info
@@ -48,11 +48,12 @@ class Look:
 
     Attributes:
         unix_s: When it was taken, seconds since 1970 by the clock of this host.
-        took_s: How long it took.
+        took_s: How long it took, without the slots.
         shards: All shards; those that did not answer are not `reachable`.
         actors: The sessions of named actors, this process's own left out.
         locks: All locks held or awaited, the oldest first within each shard.
-        slots: The newest version of each slot, null ones too.
+        slots: The newest version of each slot, null ones too; None: they were not looked at.
+        slots_took_s: How long these took.
     """
 
     unix_s: float
@@ -60,50 +61,53 @@ class Look:
     shards: tuple[ShardInfo, ...] = ()
     actors: tuple[ActorInfo, ...] = ()
     locks: tuple[LockInfo, ...] = ()
-    slots: Mapping[Slot, SlotInfo] = field(default_factory=dict)
+    slots: Mapping[Slot, SlotInfo] | None = field(default_factory=dict)
+    slots_took_s: float = 0.0
 
 
-def look_at(client: CellClient, entities: str = "**", worlds: tuple[str, ...] = ()) -> Look:
+def look_at(client: CellClient, slots: Survey | None) -> Look:
     """Take a look at a cell; see `Cell.look`."""
     client.check_usable()
-    started_s, unix_s = time.monotonic(), time.time()
-    shards, problems = client.shards(), dict[str, str]()
-    hellos = [
-        (shard, client.core.hello(shard)) for shard in shards if client.core.needs_hello(shard)
-    ]
-    silent = {
-        shard
-        for (shard, _), answer in zip(hellos, _answers(client, hellos, problems), strict=True)
-        if answer is None
-    }
+    started_s, unix_s, problems = time.monotonic(), time.time(), dict[str, str]()
+    shards = client.shards()
+    strange = [shard for shard in shards if client.core.needs_hello(shard)]
+    greeted = _answers(client, [(shard, client.core.hello(shard)) for shard in strange], problems)
+    silent = {shard for shard, answer in zip(strange, greeted, strict=True) if answer is None}
     asked = [shard for shard in shards if shard not in silent]
-    questions = (ListSessions(), ListLocks(), Survey(worlds, (entities,), ()))
-    calls: list[Call] = [(shard, question) for question in questions for shard in asked]
     asked_s = time.monotonic()
-    answers = _answers(client, calls, problems)
+    calls: list[Call] = [(shard, ListSessions()) for shard in asked]
+    calls += [(shard, ListLocks()) for shard in asked]
+    answers = list(zip(calls, _answers(client, calls, problems), strict=True))
     round_trip_s = time.monotonic() - asked_s
-    sessions = dict(zip(asked, answers, strict=False))
-    there = [(shard, one) for shard, one in sessions.items() if isinstance(one, Sessions)]
+    there = [(shard, one) for (shard, _), one in answers if isinstance(one, Sessions)]
     infos = {shard: answered_info(client, shard, one, round_trip_s) for shard, one in there}
-    others = list(zip(calls, answers, strict=True))
-    return Look(
+    look = Look(
         unix_s,
         time.monotonic() - started_s,
         tuple(infos.get(shard) or _away(client, shard, problems) for shard in shards),
         tuple(one for one in actor_infos(there) if one.session != client.core.session),
         tuple(
             lock_info(shard, holder)
-            for (shard, _), answer in others
+            for (shard, _), answer in answers
             if isinstance(answer, Locks)
             for holder in answer.holders
         ),
-        {
-            state.slot: slot_info(shard, state)
-            for (shard, _), answer in others
-            if isinstance(answer, Surveyed)
-            for state in answer.states
-        },
+        None,
     )
+    return look if slots is None else _with_slots(client, look, slots, list(infos))
+
+
+def _with_slots(client: CellClient, look: Look, survey: Survey, shards: Sequence[str]) -> Look:
+    """Add the slots of the shards that have answered."""
+    started_s = time.monotonic()
+    answers = _answers(client, [(shard, survey) for shard in shards], {})
+    slots = {
+        state.slot: slot_info(shard, state)
+        for shard, answer in zip(shards, answers, strict=True)
+        if isinstance(answer, Surveyed)
+        for state in answer.states
+    }
+    return replace(look, slots=slots, slots_took_s=time.monotonic() - started_s)
 
 
 def _answers(

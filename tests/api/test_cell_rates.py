@@ -4,7 +4,7 @@ import pytest
 
 from enact_dist.access.snapshot import SlotInfo
 from enact_dist.core.protocol.datum import Position, Slot
-from enact_dist.operate.cell_rates import LEASE_NAMES, Looks, pause_s
+from enact_dist.operate.cell_rates import LEASE_NAMES, CellLooks, Looks, pause_s
 from enact_dist.terms import Entity
 from enact_dist.world.listings import ActorInfo, LockInfo, ShardInfo
 from enact_dist.world.look import Look
@@ -189,6 +189,38 @@ def test_slots_change_by_their_versions():
         ("camera/a", 0.0, 0.0),
         ("camera/b", 4.0, 4_000.0),
     ]
+
+
+def test_look_without_slots_keeps_the_rates_of_the_last_one_with_them():
+    """The next one that asks for them is compared with that, over all the time between."""
+    looks = Looks()
+    looks.add(Look(T0_S, shards=(shard(uptime_s=1.0),), slots=slots(a=10)))
+    looks.add(Look(T0_S, shards=(shard(uptime_s=2.0),), slots=slots(a=12)))
+    writer = actor(writes=["online:camera/a/image"])
+    without = looks.add(Look(T0_S, shards=(shard(uptime_s=4.0),), actors=(writer,), slots=None))
+    then = looks.add(Look(T0_S, shards=(shard(uptime_s=7.0),), slots=slots(a=32)))
+
+    assert [(one.version, one.hz) for one in without.data] == [(12, 2.0)]
+    assert without.actors[0].wrote_age_s == pytest.approx(0.5)
+    assert [(one.version, one.hz) for one in then.data] == [(32, 4.0)]
+
+
+def test_slots_of_a_large_cell_are_looked_at_less_often():
+    """All else is looked at each time."""
+    asked = []
+
+    class Large:
+        def look(self, survey):
+            asked.append(survey is not None)
+            took_s = 5.0 if survey is not None else 0.0
+            return Look(T0_S, slots={} if took_s else None, slots_took_s=took_s)
+
+    looks = CellLooks(Large())
+    for _ in range(3):
+        looks.take()
+    looks.take(slots=True)
+
+    assert asked == [True, False, False, True]
 
 
 def test_looks_at_a_slow_cell_are_rare():

@@ -89,7 +89,7 @@ def test_other_code_ends_with_status_4_and_the_difference(replay, enact, weighed
     loose = replay("--name", "scale", "--tolerance", "weight=10")
 
     assert by_option.status == 4
-    assert "18 apart: 9 against 27" in by_option.out
+    assert "18 apart: 9.0 against 27.0" in by_option.out
     assert "online then" in by_option.out
     assert by_table.status == 4
     assert by_table.json["differs"]

@@ -13,7 +13,7 @@ from enact_dist.cli.top.tables import TABLES, headline
 from enact_dist.cli.verbs import DONE, UNREACHABLE
 from enact_dist.errors import ConfigError
 from enact_dist.link.signals import StopSignals
-from enact_dist.operate.cell_rates import Looks, pause_s
+from enact_dist.operate.cell_rates import CellLooks, pause_s
 
 if TYPE_CHECKING:
     import argparse
@@ -39,22 +39,18 @@ def run_top(options: argparse.Namespace) -> int:
             " (pip install -e '.[view]' in the clone of enact-dist); enact top --once needs it not"
         )
     with StopSignals() as stop, open_cell(options) as cell:
-        looks = Looks()
-
-        def look() -> CellRates:
-            return looks.add(cell.look(options.entities, options.world or ()))
-
+        looks = CellLooks(cell, options.entities, options.world or ())
         if on_screen:
             from enact_dist.cli.top.screen import TopApp
 
-            screen = TopApp(cell.name, look, every_s=options.every)
+            screen = TopApp(cell.name, looks.take, every_s=options.every)
             stop.call(lambda _: screen.end())
             screen.run()
             last = screen.checked()
         else:
-            first = look()
+            first = looks.take()
             stop.event.wait(pause_s(options.every, first.took_s))
-            last = look()
+            last = looks.take(slots=True)
             _print(cell, last, as_json=options.json)
     return UNREACHABLE if last is not None and last.away else DONE
 
