@@ -82,6 +82,7 @@ class Looks:
         self._last: Look | None = None
         self._slots: Mapping[Slot, SlotInfo] = {}
         self._slots_of: dict[str, ShardInfo] = {}
+        self._written = _Written({})
         self._rows: tuple[DatumRates, ...] = ()
         self._shards: dict[str, ShardInfo] = {}
         self._first: dict[str, tuple[int, Mapping[str, int]]] = {}
@@ -143,7 +144,7 @@ class Looks:
         shards = {shard.name: shard for shard in look.shards if shard.reachable}
         spans_s = {name: _span_s(self._slots_of.get(name), one) for name, one in shards.items()}
         self._rows = tuple(self._data(look, look.slots, spans_s))
-        self._slots = look.slots
+        self._slots, self._written = look.slots, _Written(look.slots)
         self._slots_of.update(shards)
 
     def _note_actors(self, look: Look) -> None:
@@ -218,7 +219,6 @@ class Looks:
                     )
 
     def _actors(self, look: Look) -> Iterator[ActorRates]:
-        written = _Written(look.unix_s, self._slots)
         for info in look.actors:
             reports = _reports(info)
             session: dict[str, Any] = {
@@ -236,7 +236,7 @@ class Looks:
                     name,
                     state="silent" if info.silent else str(report.get("state", "")),
                     runs_hz=None if info.silent else _number(report, "rate_hz"),
-                    wrote_age_s=written.age_s(report.get("writes")),
+                    wrote_age_s=self._written.age_s(report.get("writes"), look.unix_s),
                     restarts=self._restarts.get(name, 0),
                     last_error=str(report.get("last_error", "")),
                     **_figures(report),
@@ -306,15 +306,14 @@ def _largest(reports: Iterable[Mapping[str, Any]], name: str) -> float:
 class _Written:
     """The newest commit of each aspect's slots, found by what an actor declares to write."""
 
-    def __init__(self, unix_s: float, slots: Mapping[Slot, SlotInfo]) -> None:
-        self._unix_s = unix_s
+    def __init__(self, slots: Mapping[Slot, SlotInfo]) -> None:
         self._stamps_ns: dict[tuple[str, str], dict[str, int]] = {}
         for slot, info in slots.items():
             if not info.null_reason:
                 stamps_ns = self._stamps_ns.setdefault((slot.context, slot.aspect), {})
                 stamps_ns[slot.entity] = info.position.stamp_ns
 
-    def age_s(self, writes: object) -> float | None:
+    def age_s(self, writes: object, unix_s: float) -> float | None:
         """Return the age of the newest datum of ``world:entities/aspect``; None: of none."""
         newest_ns = 0
         for text in writes if isinstance(writes, (list, tuple)) else ():
@@ -326,4 +325,4 @@ class _Written:
                 continue
             found = (ns for entity, ns in stamps_ns.items() if pattern_matches(pattern, entity))
             newest_ns = max(newest_ns, *found, 0)
-        return max(0.0, self._unix_s - newest_ns / 1e9) if newest_ns else None
+        return max(0.0, unix_s - newest_ns / 1e9) if newest_ns else None

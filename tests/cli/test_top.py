@@ -208,7 +208,7 @@ def test_many_rows_are_counted_beyond_those_that_are_shown(monkeypatch):
         async with top() as screen:
             await screen.show(look())
             assert screen.column("a") == ["arm", "camera"]
-            assert screen.app._panel(TABLES[1]).border_title == "actors: 3, 1 more"
+            assert screen.app._panel(TABLES[1]).border_title == "actors: 3, the first 2 shown"
 
     asyncio.run(inside())
 
@@ -217,7 +217,10 @@ def test_unknown_figures_come_last():
     """Before there are two looks no rate is known."""
     rates = Looks().add(look())
 
-    assert TABLES[0].lines(rates, column=3) == TABLES[0].lines(rates, column=3, turned=True)
+    shards = TABLES[0]
+    assert shards.lines(rates, 9, column=3) == shards.lines(rates, 9, column=3, turned=True)
+    assert shards.lines(rates, 9, only="LEFT")[1] == 1
+    assert shards.lines(rates, 9, only="right") == ([], 0)
     assert headline(rates).startswith("1 of 1 shards, - commits, 3 actors")
 
 

@@ -62,14 +62,11 @@ def _print(cell: Cell, rates: CellRates, *, as_json: bool) -> None:
     clock = time.strftime("%H:%M:%S", time.localtime(rates.unix_s))
     print(f"cell {cell.name} at {clock}, over {rates.seconds:.1f} s: {headline(rates)}")
     for table in TABLES:
-        lines = table.lines(rates)
+        lines, count = table.lines(rates, ROWS_PRINTED_MAX)
         print()
-        print_table(
-            [column.name for column in table.columns], lines[:ROWS_PRINTED_MAX], empty=table.empty
-        )
-        if len(lines) > ROWS_PRINTED_MAX:
-            left = len(lines) - ROWS_PRINTED_MAX
-            print(f"… {left} more {table.title}: enact top --once --json lists them")
+        print_table([column.name for column in table.columns], lines, empty=table.empty)
+        if count > len(lines):
+            print(f"… {count - len(lines)} more {table.title}: enact top --once --json lists them")
     for shard in rates.away:
         why = f": {shard.problem}" if shard.problem else " does not answer"
         print(f"enact: shard {shard.name} at {shard.endpoint}{why}", file=sys.stderr)

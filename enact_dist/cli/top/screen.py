@@ -253,17 +253,18 @@ class TopApp(App[None]):
 
     def _draw_rows(self, table: TopTable, rates: CellRates) -> None:
         panel, key = self._panel(table), table.key
-        lines = table.lines(
-            rates, column=self._column[key], turned=self._turned[key], only=self._only
+        column, turned = self._column[key], self._turned[key]
+        lines, count = table.lines(
+            rates, ROWS_SHOWN_MAX, column=column, turned=turned, only=self._only
         )
         row, at = panel.cursor_row, panel.scroll_offset
         panel.clear()
-        for line in lines[:ROWS_SHOWN_MAX]:
+        for line in lines:
             panel.add_row(*(Text(shown(text)) for text in line))
         panel.move_cursor(row=row, scroll=False)
         panel.scroll_to(*at, animate=False)
-        more = f", {len(lines) - ROWS_SHOWN_MAX} more" if len(lines) > ROWS_SHOWN_MAX else ""
-        panel.border_title = f"{table.title}: {len(lines)}{more}"
+        more = f", the first {len(lines)} shown" if count > len(lines) else ""
+        panel.border_title = f"{table.title}: {count}{more}"
         panel.border_subtitle = "" if lines else table.empty
 
     def _headline(self, rates: CellRates) -> str:

@@ -53,12 +53,19 @@ class TopTable:
     empty: str
 
     def lines(
-        self, rates: CellRates, *, column: int | None = None, turned: bool = False, only: str = ""
-    ) -> list[tuple[str, ...]]:
-        """Return the texts of the rows.
+        self,
+        rates: CellRates,
+        most: int,
+        *,
+        column: int | None = None,
+        turned: bool = False,
+        only: str = "",
+    ) -> tuple[list[tuple[str, ...]], int]:
+        """Return the texts of the first rows, and how many rows there are.
 
         Args:
             rates: What two looks have shown.
+            most: At most so many texts are made.
             column: Which column they are sorted by; None: `first`.
             turned: Whether to sort them in the other direction.
             only: Only rows with this text in one of their columns, whatever its case.
@@ -68,9 +75,18 @@ class TopTable:
         known = [row for row in rows if by.value(row) is not None]
         unknown = [row for row in rows if by.value(row) is None]
         known.sort(key=by.value, reverse=by.falls != turned)
-        lines = [tuple(one.text(row) for one in self.columns) for row in (*known, *unknown)]
-        wanted = only.casefold()
-        return [line for line in lines if any(wanted in text.casefold() for text in line)]
+        wanted, chosen = only.casefold(), [*known, *unknown]
+        if not wanted:
+            return [self._texts(row) for row in chosen[:most]], len(chosen)
+        lines = [
+            line
+            for line in map(self._texts, chosen)
+            if any(wanted in text.casefold() for text in line)
+        ]
+        return lines[:most], len(lines)
+
+    def _texts(self, row: Any) -> tuple[str, ...]:
+        return tuple(column.text(row) for column in self.columns)
 
 
 def _per_s(value: float | None) -> str:
