@@ -18,7 +18,7 @@ from enact_dist.terms import Aspect
 
 if TYPE_CHECKING:
     from enact_dist.actor.actor import Actor
-    from enact_dist.actor.step import StepResult
+    from enact_dist.actor.running.step import StepResult
 
 
 def run_step(options: argparse.Namespace) -> int:
@@ -27,7 +27,7 @@ def run_step(options: argparse.Namespace) -> int:
     Raises:
         ConfigError: No actor is named, or it cannot be made.
     """
-    from enact_dist.actor.step import Step
+    from enact_dist.actor.running.step import Step
 
     world, name = options.step
     try:

@@ -23,7 +23,7 @@ from enact_dist import (
     testing,
 )
 from enact_dist.actor.outcome import Outcome
-from enact_dist.actor.step import Step
+from enact_dist.actor.running.step import Step
 from enact_dist.errors import ForgottenError, MisuseError, NullDatumError
 
 LEVEL = Aspect("level_in_steps", float, compare=Tolerance(absolute=0.5))
@@ -332,6 +332,34 @@ def test_forgotten_input_is_named_with_how_to_keep_it(cell):
         Step(cell, "plant", "short", NOTE.name, 1).run(Doubled())
     result = Step(cell, "plant", "short", NOTE.name, 2).run(Doubled())
     assert not result.differs
+
+
+class Both(Actor):
+    """Writes a datum with history and one without."""
+
+    plant = World("plant")
+    level = Read(plant, Entity("tank/1"), LEVEL)
+    note, short = Write(plant, Entity("both"), NOTE), Write(plant, Entity("both"), SHORT)
+    triggers = (level,)
+
+    def update(self, lock):
+        lock[self.note] = str(lock[self.level])
+        lock[self.short] = int(lock[self.level])
+
+
+def test_output_that_is_forgotten_is_named_and_the_others_are_compared(cell):
+    """The version that was asked for is known."""
+    plant, actor = cell.world("plant"), Both()
+    for level in (1.0, 2.0, 3.0):
+        put(plant, "tank/1", LEVEL, level)
+        testing.run_once(actor, cell)
+    result = Step(cell, "plant", "both", NOTE.name, 2).run(Both())
+
+    assert result.remarks == (
+        "null in the step, because their state of that time is forgotten: plant:both/short_in_steps",
+        "not compared, because that version is forgotten: plant:both/short_in_steps",
+    )
+    assert [(diff.equal, diff.rows) for diff in result.differences] == [(1, ())]
 
 
 def test_versions_that_cannot_be_run_again_are_refused(cell):

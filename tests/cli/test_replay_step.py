@@ -144,7 +144,7 @@ def test_view_of_the_step_has_its_data_at_once(weighed):
     """A step that is kept is a world context like any other."""
     from weighing import Weigh
 
-    from enact_dist.actor.step import Step
+    from enact_dist.actor.running.step import Step
 
     with connect(weighed) as cell:
         names = Step(cell, "online", "piece/1", "weight").run(Weigh(5.0), keep_as="seen").contexts
