@@ -55,9 +55,7 @@ NOUNS: Final = {
     "impact": Noun(
         "world.lineage", "show what was made from a datum, and from that in turn", "time"
     ),
-    "invalidate": Noun(
-        "world.lineage", "make a wrong datum null, and what was made of it", "time"
-    ),
+    "invalidate": Noun("world.lineage", "make a wrong datum null, and what was made of it", "time"),
     "record": Noun(
         "record",
         "record every version of a cell's data into an MCAP file until Ctrl-C",

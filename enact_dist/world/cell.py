@@ -47,6 +47,7 @@ from enact_dist.world.listings import (
     actor_infos,
     aspect_infos,
     lock_info,
+    sessions_named,
     shard_info,
 )
 from enact_dist.world.look import Look, look_at
@@ -443,16 +444,7 @@ class Cell(FormerNames, Closing):
         All shards are asked, because the other may be known to one of them alone; none is waited
         for longer than one call.
         """
-        client, shards = self._client, self._client.shards()
-        answers = client.call_once([(shard, ListSessions()) for shard in shards])
-        infos = actor_infos(zip(shards, answers, strict=True))
-        return tuple(
-            info
-            for info in infos
-            if name in (info.actor, *info.names())
-            and not info.silent
-            and info.session != client.core.session
-        )
+        return sessions_named(self._client, name)
 
     def set_report(self, report: bytes) -> None:
         """Send an actor's statistics with the keep-alives: msgpack of a map, up to 4 KiB."""

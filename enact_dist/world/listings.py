@@ -255,6 +255,19 @@ def actor_infos(answers: Iterable[tuple[str, Answer | None]]) -> tuple[ActorInfo
     return tuple(_with_namesakes(infos))
 
 
+def sessions_named(client: CellClient, name: str) -> tuple[ActorInfo, ...]:
+    """Return the other sessions of actors of a name that are not silent."""
+    shards = client.shards()
+    answers = client.call_once([(shard, ListSessions()) for shard in shards])
+    return tuple(
+        info
+        for info in actor_infos(zip(shards, answers, strict=True))
+        if name in (info.actor, *info.names())
+        and not info.silent
+        and info.session != client.core.session
+    )
+
+
 def _with_namesakes(infos: list[ActorInfo]) -> Iterator[ActorInfo]:
     sessions: dict[str, list[str]] = {}
     for info in infos:
