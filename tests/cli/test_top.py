@@ -126,11 +126,14 @@ async def test_screen_shows_all_panels_and_each_alone(screen):
 
 @on_screen
 async def test_locks_name_what_they_wait_for(screen):
-    """Who waits for whom."""
+    """Who waits for whom; the row that is marked stays so."""
     await screen.show(look())
 
     assert screen.column("l") == ["1", "2"]
     assert screen.column("l", 9) == ["-", "1 (arm@h pid 1)"]
+    await screen.pilot.press("l", "down")
+    await screen.show(look(1))
+    assert screen.app._panel(TABLES[2]).cursor_row == 1
 
 
 @on_screen

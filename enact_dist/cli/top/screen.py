@@ -114,8 +114,6 @@ class TopApp(App[None]):
 
     def on_mount(self) -> None:
         """Begin to look."""
-        for table in TABLES:
-            self._draw_columns(table)
         self._arrange()
         self._draw()
         self.run_worker(self._look_on, thread=True)
@@ -198,14 +196,12 @@ class TopApp(App[None]):
         table = self._in_use()
         self._column[table.key] = (self._column[table.key] + 1) % len(table.columns)
         self._turned[table.key] = False
-        self._draw_columns(table)
         self._draw()
 
     def action_turn(self) -> None:
         """Sort the panel in use in the other direction."""
         table = self._in_use()
         self._turned[table.key] = not self._turned[table.key]
-        self._draw_columns(table)
         self._draw()
 
     def action_pause(self) -> None:
@@ -229,16 +225,6 @@ class TopApp(App[None]):
         panel: DataTable[Text] = self.query_one(f"#panel-{table.key}", DataTable)
         return panel
 
-    def _draw_columns(self, table: TopTable) -> None:
-        """Name the columns, with an arrow at the one that the rows are sorted by."""
-        panel, by = self._panel(table), self._column[table.key]
-        falls = table.columns[by].falls != self._turned[table.key]
-        panel.clear(columns=True)
-        for index, column in enumerate(table.columns):
-            panel.add_column(
-                f"{column.name} {'▼' if falls else '▲'}" if index == by else column.name
-            )
-
     def _draw(self) -> None:
         rates = self._rates
         if rates is None:
@@ -248,7 +234,7 @@ class TopApp(App[None]):
         self.query_one("#away", Static).update(Text("\n".join(_away(rates))))
         self.query_one("#events", Static).update(Text("\n".join(_events(rates))))
         for table in TABLES:
-            if self._alone in {"", table.key}:
+            if self._panel(table).display:
                 self._draw_rows(table, rates)
 
     def _draw_rows(self, table: TopTable, rates: CellRates) -> None:
@@ -258,7 +244,11 @@ class TopApp(App[None]):
             rates, ROWS_SHOWN_MAX, column=column, turned=turned, only=self._only
         )
         row, at = panel.cursor_row, panel.scroll_offset
-        panel.clear()
+        panel.clear(columns=True)  # their widths, too
+        falls = table.columns[column].falls != turned
+        for index, one in enumerate(table.columns):
+            arrow = f" {'▼' if falls else '▲'}" if index == column else ""
+            panel.add_column(one.name + arrow)
         for line in lines:
             panel.add_row(*(Text(shown(text)) for text in line))
         panel.move_cursor(row=row, scroll=False)
