@@ -1,6 +1,6 @@
 """Rules for all tests: nothing skipped in CI, Ctrl-C as at a terminal, no lock left behind.
 
-Which cases of long tests (`sampled`) and which tests of the applications a run takes.
+Which cases of long tests (`sampled`) and which tests of applications and tools a run takes.
 
 And over which carrier each of them runs, see `carriers.py` beside this file.
 """
@@ -21,8 +21,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 import carriers
 import ports
 
-APPLICATIONS = Path(__file__).parent / "actors"
-"""Of the tests of the applications each run takes half of the files of a folder.
+HALVED = [Path(__file__).parent / name for name in ("actors", "bench", "recording", "verify")]
+"""Of the tests of applications and tools each run takes half of the files of a folder.
 
 Of the files with other slow tests it takes the slow ones of two in three.
 """
@@ -58,7 +58,7 @@ def pytest_collection_modifyitems(config, items):
     groups = defaultdict(lambda: defaultdict(list))
     for item in items:
         mark = item.get_closest_marker("sampled")
-        if mark is None and APPLICATIONS in item.path.parents:
+        if mark is None and any(folder in item.path.parents for folder in HALVED):
             groups[item.path.parent, 1 / 2][item.path.name].append(item)
         elif mark is None and item.get_closest_marker("slow"):
             groups["slow", 2 / 3][str(item.path)].append(item)
@@ -69,7 +69,7 @@ def pytest_collection_modifyitems(config, items):
             elif of == "file":
                 of = str(item.path)
             else:  # some of several files, whole
-                case = item.path.name
+                case = str(item.path)
             groups[of, mark.args[0]][case].append(item)
     left_out = set()
     for (_, count), cases in groups.items():
