@@ -23,34 +23,37 @@ from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletio
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from foxglove_schemas_protobuf.TriangleListPrimitive_pb2 import TriangleListPrimitive
 
+from enact_dist.recording.drawing.drawables import (
+    ShownCamera,
+    ShownCapsules,
+    ShownCloud,
+    ShownImage,
+    ShownJoints,
+    ShownMesh,
+    ShownPlain,
+    ShownPose,
+    ShownTransform,
+    ShownVoxels,
+    drawables_of,
+)
 from enact_dist.recording.drawing.geometry import (
     encoded_indices,
     encoded_points,
     image_bytes,
-    is_rigid,
     packed_points,
     quaternion,
 )
-from enact_dist.recording.drawing.parts import (
-    array_beside,
-    arrays_of,
-    guess,
-    is_image,
-    is_points,
-    number_of,
-    part_at,
-    parts_of,
-)
-from enact_dist.recording.drawing.solids import capsule_of, voxel_faces
+from enact_dist.recording.drawing.solids import voxel_faces
 from enact_dist.wire.payload import decode_untyped
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
 
     from google.protobuf.message import Message
     from numpy.typing import NDArray
 
     from enact_dist.config.shows import Shows
+    from enact_dist.recording.drawing.drawables import Drawable
     from enact_dist.recording.exact import Recorded
 
 ELEMENTS_MAX: Final = 256
@@ -62,11 +65,6 @@ VOXEL_COLOUR: Final = (0.95, 0.55, 0.15, 0.9)
 CAPSULE_COLOUR: Final = (0.25, 0.5, 0.85, 0.8)
 _SCENES: Final = ("mesh", "voxels", "capsules")
 """Kinds that are entities of a scene: they stay until another one replaces them."""
-_CAMERA: Final = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px")
-_BY_SHAPE: Final = {
-    ("u1", 2): "mono8", ("u1", 3): "rgb8", ("u1", 4): "rgba8", ("u2", 2): "16UC1",
-    ("f4", 2): "32FC1",
-}  # fmt: skip
 
 
 class Picture(NamedTuple):
@@ -97,15 +95,13 @@ def pictures_of(recorded: Recorded, shows: Shows) -> Pictures:
     if recorded.datum is None:
         return Pictures([*_endings(recorded, shows)], [])
     value = decode_untyped(recorded.datum)
-    part = part_at(value, shows.of)
-    kinds = shows.kinds or (guess(value),)
     pictures, unfit = [], []
-    for kind in kinds:
-        message = _KINDS[kind](recorded, shows, part)
+    for number, (kind, drawable) in enumerate(drawables_of(value, shows).items()):
+        message = _message(recorded, shows, drawable) if drawable is not None else None
         if message is None:
             unfit.append(kind)
         else:
-            pictures.append(Picture("" if kind == kinds[0] else f"/{kind}", message))
+            pictures.append(Picture(f"/{kind}" if number else "", message))
     if not pictures:
         pictures.append(Picture("/json", _json(recorded, value)))
     return Pictures(pictures, unfit)
@@ -124,7 +120,7 @@ def _endings(recorded: Recorded, shows: Shows) -> Iterator[Picture]:
             yield Picture(suffix, update)
         elif kind == "point_cloud":
             frame = shows.frame_of(recorded.slot.entity)
-            yield Picture(suffix, _cloud(stamp_ns, frame, np.empty((0, 3)), None))
+            yield Picture(suffix, _cloud(stamp_ns, frame, ShownCloud(np.empty((0, 3)), None)))
         elif kind == "joints":
             states = JointStates()
             states.timestamp.FromNanoseconds(stamp_ns)
@@ -142,33 +138,22 @@ def _stamp_ns(recorded: Recorded) -> int:
     return recorded.captured_ns or recorded.stamp_ns
 
 
-def _image(recorded: Recorded, shows: Shows, part: object) -> Message | None:
-    array = next((array for array, _ in arrays_of(part) if is_image(array)), None)
-    if array is None:
-        return None
-    channels = array.shape[2] if array.ndim == 3 else 2
-    kind = array.dtype.kind + str(array.dtype.itemsize)
-    encoding = shows.encoding or _BY_SHAPE[kind, channels]
-    return _raw_image(recorded, shows, array, encoding)
+def _message(
+    recorded: Recorded, shows: Shows, drawable: Drawable
+) -> Message | dict[str, object] | None:
+    """Return a drawable as a message; None if no message can hold it."""
+    write: Any = _MESSAGES[type(drawable)]
+    found: Message | dict[str, object] | None = write(recorded, shows, drawable)
+    return found
 
 
-def _mask(recorded: Recorded, shows: Shows, part: object) -> Message | None:
-    for array, beside in arrays_of(part):
-        if array.ndim == 2 and array.dtype.kind + str(array.dtype.itemsize) in ("b1", "u1"):
-            if array is beside.get("packed"):
-                array = np.unpackbits(array, axis=1)  # noqa: PLW2901 - bits for pixels
-            pixels = np.where(array != 0, np.uint8(255), np.uint8(0))
-            return _raw_image(recorded, shows, pixels, "mono8")
-    return None
-
-
-def _raw_image(recorded: Recorded, shows: Shows, pixels: NDArray[Any], encoding: str) -> Message:
-    data, step = image_bytes(pixels)
+def _image(recorded: Recorded, shows: Shows, shown: ShownImage) -> Message:
+    data, step = image_bytes(shown.pixels)
     image = RawImage(
         frame_id=shows.frame_of(recorded.slot.entity),
-        width=pixels.shape[1],
-        height=pixels.shape[0],
-        encoding=encoding,
+        width=shown.pixels.shape[1],
+        height=shown.pixels.shape[0],
+        encoding=shown.encoding,
         step=step,
         data=data,
     )
@@ -176,19 +161,12 @@ def _raw_image(recorded: Recorded, shows: Shows, pixels: NDArray[Any], encoding:
     return image
 
 
-def _point_cloud(recorded: Recorded, shows: Shows, part: object) -> Message | None:
-    for array, beside in arrays_of(part):
-        if is_points(array):
-            frame = shows.frame_of(recorded.slot.entity)
-            colours = array_beside(beside, "u", len(array))
-            return _cloud(_stamp_ns(recorded), frame, array, colours)
-    return None
+def _point_cloud(recorded: Recorded, shows: Shows, shown: ShownCloud) -> Message:
+    return _cloud(_stamp_ns(recorded), shows.frame_of(recorded.slot.entity), shown)
 
 
-def _cloud(
-    stamp_ns: int, frame: str, points_m: NDArray[Any], colours: NDArray[Any] | None
-) -> Message:
-    data, stride, fields = packed_points(points_m, colours)
+def _cloud(stamp_ns: int, frame: str, shown: ShownCloud) -> Message:
+    data, stride, fields = packed_points(*shown)
     cloud = PointCloud(frame_id=frame, point_stride=stride, data=data)
     cloud.timestamp.FromNanoseconds(stamp_ns)
     cloud.pose.orientation.w = 1.0
@@ -198,14 +176,10 @@ def _cloud(
     return cloud
 
 
-def _mesh(recorded: Recorded, shows: Shows, part: object) -> Message | None:
-    for array, beside in arrays_of(part):
-        triangles = array_beside(beside, "iu") if is_points(array) else None
-        if triangles is not None:
-            update, entity = _scene(recorded, shows)
-            entity.triangles.append(_triangles(array, triangles, SURFACE_COLOUR))
-            return update
-    return None
+def _mesh(recorded: Recorded, shows: Shows, shown: ShownMesh) -> Message:
+    update, entity = _scene(recorded, shows)
+    entity.triangles.append(_triangles(*shown, SURFACE_COLOUR))
+    return update
 
 
 def _scene(recorded: Recorded, shows: Shows) -> tuple[SceneUpdate, Any]:
@@ -218,74 +192,44 @@ def _scene(recorded: Recorded, shows: Shows) -> tuple[SceneUpdate, Any]:
     return update, entity
 
 
-def _voxels(recorded: Recorded, shows: Shows, part: object) -> Message | None:
-    for array, beside in arrays_of(part):
-        if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "iu":
-            continue
-        voxel_m = number_of(beside.get("voxel_m")) or shows.voxel_m
-        origin_m = beside.get("origin_m")
-        if not isinstance(origin_m, np.ndarray) or origin_m.dtype.kind not in "fiu":
-            origin_m = np.array(shows.origin_m)
-        if not voxel_m or origin_m.shape != (3,):
-            return None
-        try:
-            corners, triangles = voxel_faces(array)
-        except ValueError:
-            return None
-        update, entity = _scene(recorded, shows)
-        if len(triangles):
-            vertices_m = origin_m + voxel_m * corners
-            entity.triangles.append(_triangles(vertices_m, triangles, VOXEL_COLOUR))
-        return update
-    return None
+def _voxels(recorded: Recorded, shows: Shows, shown: ShownVoxels) -> Message | None:
+    try:
+        corners, triangles = voxel_faces(shown.indices)
+    except ValueError:
+        return None
+    update, entity = _scene(recorded, shows)
+    if len(triangles):
+        vertices_m = shown.origin_m + shown.voxel_m * corners
+        entity.triangles.append(_triangles(vertices_m, triangles, VOXEL_COLOUR))
+    return update
 
 
-def _capsules(recorded: Recorded, shows: Shows, part: object) -> Message | None:
-    for array, _ in arrays_of(part):
-        if array.ndim != 2 or array.shape[1] != 7 or array.dtype.kind != "f":
-            continue
-        update, entity = _scene(recorded, shows)
-        for row in array[np.isfinite(array).all(axis=1)]:
-            capsule = capsule_of(row)
-            wide_m = 2.0 * capsule.radius_m
-            solids = [(entity.spheres.add(), end_m, wide_m) for end_m in capsule.ends_m]
-            if capsule.length_m > 0.0:
-                cylinder = entity.cylinders.add(bottom_scale=1.0, top_scale=1.0)
-                solids.append((cylinder, capsule.pose[:3, 3], capsule.length_m))
-            for solid, middle_m, high_m in solids:
-                matrix = capsule.pose.copy()
-                matrix[:3, 3] = middle_m
-                _place(solid.pose.position, solid.pose.orientation, matrix)
-                solid.size.x, solid.size.y, solid.size.z = wide_m, wide_m, high_m
-                _paint(solid.color, CAPSULE_COLOUR)
-        return update
-    return None
+def _capsules(recorded: Recorded, shows: Shows, shown: ShownCapsules) -> Message:
+    update, entity = _scene(recorded, shows)
+    for capsule in shown.capsules:
+        wide_m = 2.0 * capsule.radius_m
+        solids = [(entity.spheres.add(), end_m, wide_m) for end_m in capsule.ends_m]
+        if capsule.length_m > 0.0:
+            cylinder = entity.cylinders.add(bottom_scale=1.0, top_scale=1.0)
+            solids.append((cylinder, capsule.pose[:3, 3], capsule.length_m))
+        for solid, middle_m, high_m in solids:
+            matrix = capsule.pose.copy()
+            matrix[:3, 3] = middle_m
+            _place(solid.pose.position, solid.pose.orientation, matrix)
+            solid.size.x, solid.size.y, solid.size.z = wide_m, wide_m, high_m
+            _paint(solid.color, CAPSULE_COLOUR)
+    return update
 
 
-def _joints(recorded: Recorded, shows: Shows, part: object) -> Message | None:
-    for array, beside in arrays_of(part):
-        if array.dtype.kind != "f" or array.ndim not in (1, 2) or not array.size:
-            continue
-        names = shows.joints or tuple(f"joint_{at + 1}" for at in range(array.shape[-1]))
-        if len(names) != array.shape[-1]:
-            return None
-        alike = [
-            other
-            for other in beside.values()
-            if isinstance(other, np.ndarray)
-            and other is not array
-            and (other.shape, other.dtype.kind) == (array.shape, "f")
-        ]
-        newest = np.atleast_2d(array)[-1]
-        speeds = np.atleast_2d(alike[0])[-1] if alike else [None] * len(newest)
-        states = JointStates()
-        states.timestamp.FromNanoseconds(_stamp_ns(recorded))
-        for name, position, speed in zip(names, newest, speeds, strict=True):
-            joint = states.joints.add(name=name, position=float(position))
-            if speed is not None:
-                joint.velocity = float(speed)
-        return states
-    return None
+def _joints(recorded: Recorded, _: Shows, shown: ShownJoints) -> Message:
+    speeds = shown.speeds if shown.speeds is not None else [None] * len(shown.names)
+    states = JointStates()
+    states.timestamp.FromNanoseconds(_stamp_ns(recorded))
+    for name, position, speed in zip(shown.names, shown.positions, speeds, strict=True):
+        joint = states.joints.add(name=name, position=float(position))
+        if speed is not None:
+            joint.velocity = float(speed)
+    return states
 
 
 def _paint(colour: Any, rgba: tuple[float, float, float, float]) -> None:
@@ -305,26 +249,21 @@ def _triangles(
     return primitive
 
 
-def _pose(recorded: Recorded, shows: Shows, part: object) -> Message | None:
-    matrix = next((array for array, _ in arrays_of(part) if is_rigid(array)), None)
-    if matrix is None:
-        return None
+def _pose(recorded: Recorded, shows: Shows, shown: ShownPose) -> Message:
     found = PoseInFrame(frame_id=shows.frame_of(recorded.slot.entity))
     found.timestamp.FromNanoseconds(_stamp_ns(recorded))
-    _place(found.pose.position, found.pose.orientation, matrix)
+    _place(found.pose.position, found.pose.orientation, shown.matrix)
     return found
 
 
-def _transform(recorded: Recorded, shows: Shows, part: object) -> Message | None:
-    matrix = next((array for array, _ in arrays_of(part) if is_rigid(array)), None)
+def _transform(recorded: Recorded, shows: Shows, shown: ShownTransform) -> Message | None:
     parent = shows.parent_of(recorded.slot.entity)
-    if matrix is None or not parent:
+    if not parent:
         return None
     child = shows.frame_of(recorded.slot.entity)
     found = FrameTransform(parent_frame_id=parent, child_frame_id=child)
     found.timestamp.FromNanoseconds(_stamp_ns(recorded))
-    matrix = np.linalg.inv(matrix) if shows.inverse else matrix
-    _place(found.translation, found.rotation, matrix)
+    _place(found.translation, found.rotation, shown.matrix)
     return found
 
 
@@ -333,47 +272,27 @@ def _place(position: Any, orientation: Any, matrix: NDArray[Any]) -> None:
     orientation.x, orientation.y, orientation.z, orientation.w = quaternion(matrix[:3, :3])
 
 
-def _calibration(recorded: Recorded, shows: Shows, part: object) -> Message | None:
-    for found in parts_of(part, {}):
-        camera = _pinhole(found.value)
-        if camera is not None:
-            width, height, matrix, distortion = camera
-            message = CameraCalibration(
-                frame_id=shows.frame_of(recorded.slot.entity), width=width, height=height
-            )
-            message.timestamp.FromNanoseconds(_stamp_ns(recorded))
-            message.K.extend(matrix.ravel().tolist())
-            message.R.extend(np.eye(3).ravel().tolist())
-            message.P.extend(np.hstack((matrix, np.zeros((3, 1)))).ravel().tolist())
-            if len(distortion):
-                message.distortion_model = "plumb_bob"
-                message.D.extend(distortion)
-            return message
-    return None
-
-
-def _pinhole(value: object) -> tuple[int, int, NDArray[np.float64], list[float]] | None:
-    """Return width, height, camera matrix and distortion of a camera; None if it is none."""
-    if not isinstance(value, dict):
-        return None
-    if all(name in value for name in _CAMERA):
-        width, height, fx, fy, cx, cy = (number_of(value[name]) for name in _CAMERA)
-        return int(width), int(height), np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), []
-    matrix, distortion = value.get("camera_matrix"), value.get("distortion")
-    width, height = number_of(value.get("width")), number_of(value.get("height"))
-    if isinstance(matrix, np.ndarray) and matrix.shape == (3, 3) and matrix.dtype.kind == "f":
-        coefficients: list[float] = []
-        if isinstance(distortion, np.ndarray) and distortion.dtype.kind == "f":
-            coefficients = distortion.ravel().tolist()
-        return int(width), int(height), matrix.astype(np.float64), coefficients
-    return None
+def _calibration(recorded: Recorded, shows: Shows, shown: ShownCamera) -> Message:
+    message = CameraCalibration(
+        frame_id=shows.frame_of(recorded.slot.entity),
+        width=shown.width_px,
+        height=shown.height_px,
+    )
+    message.timestamp.FromNanoseconds(_stamp_ns(recorded))
+    message.K.extend(shown.matrix.ravel().tolist())
+    message.R.extend(np.eye(3).ravel().tolist())
+    message.P.extend(np.hstack((shown.matrix, np.zeros((3, 1)))).ravel().tolist())
+    if len(shown.distortion):
+        message.distortion_model = "plumb_bob"
+        message.D.extend(shown.distortion)
+    return message
 
 
 # ---------------------------------------------------------------- JSON
 
 
-def _as_json(recorded: Recorded, _: Shows, part: object) -> dict[str, object]:
-    return _json(recorded, part)
+def _as_json(recorded: Recorded, _: Shows, shown: ShownPlain) -> dict[str, object]:
+    return _json(recorded, shown.value)
 
 
 def _json(recorded: Recorded, value: object) -> dict[str, object]:
@@ -425,18 +344,15 @@ def json_schema(example: object) -> dict[str, object]:
     return {}
 
 
-_KINDS: Final[
-    dict[str, Callable[[Recorded, Shows, object], Message | dict[str, object] | None]]
-] = {
-    "image": _image,
-    "mask": _mask,
-    "point_cloud": _point_cloud,
-    "mesh": _mesh,
-    "voxels": _voxels,
-    "capsules": _capsules,
-    "joints": _joints,
-    "pose": _pose,
-    "transform": _transform,
-    "calibration": _calibration,
-    "json": _as_json,
+_MESSAGES: Final = {
+    ShownImage: _image,
+    ShownCloud: _point_cloud,
+    ShownMesh: _mesh,
+    ShownVoxels: _voxels,
+    ShownCapsules: _capsules,
+    ShownJoints: _joints,
+    ShownPose: _pose,
+    ShownTransform: _transform,
+    ShownCamera: _calibration,
+    ShownPlain: _as_json,
 }

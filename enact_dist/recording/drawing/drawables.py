@@ -1,0 +1,300 @@
+"""What can be shown of a datum, whatever shows it: images, clouds, meshes, solids, poses, cameras.
+
+`enact_dist.config.shows` lists what is shown as which kind.  `pictures` writes these things as
+Foxglove's messages, `enact_dist.view` draws them in a browser.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+
+from enact_dist.recording.drawing.geometry import is_rigid
+from enact_dist.recording.drawing.parts import (
+    array_beside,
+    arrays_of,
+    guess,
+    is_image,
+    is_points,
+    number_of,
+    part_at,
+    parts_of,
+)
+from enact_dist.recording.drawing.solids import Capsule, capsule_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from enact_dist.config.shows import Shows
+
+_CAMERA: Final = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px")
+_BY_SHAPE: Final = {
+    ("u1", 2): "mono8", ("u1", 3): "rgb8", ("u1", 4): "rgba8", ("u2", 2): "16UC1",
+    ("f4", 2): "32FC1",
+}  # fmt: skip
+
+
+class ShownImage(NamedTuple):
+    """An image, or a mask as 0 and 255.
+
+    Attributes:
+        pixels: (H, W), (H, W, 3) or (H, W, 4), of the dtype that the encoding says.
+        encoding: One of `enact_dist.config.shows.ENCODINGS`.
+    """
+
+    pixels: NDArray[Any]
+    encoding: str
+
+
+class ShownCloud(NamedTuple):
+    """Points.
+
+    Attributes:
+        points_m: (N, 3) floats, metres.
+        colours: (N, 3) uint8, red, green, blue; None: the cloud has none.
+    """
+
+    points_m: NDArray[Any]
+    colours: NDArray[Any] | None
+
+
+class ShownMesh(NamedTuple):
+    """A surface.
+
+    Attributes:
+        vertices_m: (N, 3) floats, metres.
+        triangles: (M, 3) integers, numbers of vertices.
+    """
+
+    vertices_m: NDArray[Any]
+    triangles: NDArray[Any]
+
+
+class ShownVoxels(NamedTuple):
+    """Occupied voxels.
+
+    Attributes:
+        indices: (N, 3) integers in the grid.
+        voxel_m: Edge of a voxel, above 0.
+        origin_m: (3,) lowest corner of the grid.
+    """
+
+    indices: NDArray[Any]
+    voxel_m: float
+    origin_m: NDArray[Any]
+
+
+class ShownCapsules(NamedTuple):
+    """Capsules, those of finite numbers alone."""
+
+    capsules: tuple[Capsule, ...]
+
+
+class ShownJoints(NamedTuple):
+    """Joints by name.
+
+    Attributes:
+        names: Of the joints.
+        positions: (J,) floats, rad or m.
+        speeds: (J,) floats, rad/s or m/s; None: the datum has none.
+    """
+
+    names: tuple[str, ...]
+    positions: NDArray[Any]
+    speeds: NDArray[Any] | None
+
+
+class ShownPose(NamedTuple):
+    """Where a thing is in its frame: (4, 4) rigid, metres."""
+
+    matrix: NDArray[Any]
+
+
+class ShownTransform(NamedTuple):
+    """Where a frame is in its parent: (4, 4) rigid, metres."""
+
+    matrix: NDArray[Any]
+
+
+class ShownCamera(NamedTuple):
+    """A pinhole camera.
+
+    Attributes:
+        width_px: Columns of its image.
+        height_px: Rows of its image.
+        matrix: (3, 3) floats, pixels.
+        distortion: Coefficients as OpenCV orders them; empty if it has none.
+    """
+
+    width_px: int
+    height_px: int
+    matrix: NDArray[np.float64]
+    distortion: list[float]
+
+
+class ShownPlain(NamedTuple):
+    """Anything else: numbers, texts, lists and dicts."""
+
+    value: object
+
+
+Drawable = (
+    ShownImage
+    | ShownCloud
+    | ShownMesh
+    | ShownVoxels
+    | ShownCapsules
+    | ShownJoints
+    | ShownPose
+    | ShownTransform
+    | ShownCamera
+    | ShownPlain
+)
+
+
+def drawables_of(value: object, shows: Shows) -> dict[str, Drawable | None]:
+    """Return what is shown of a datum that was decoded without its type, by kind.
+
+    Args:
+        value: The datum.
+        shows: What its aspect is shown as.
+
+    Returns:
+        One entry for each kind that is wanted, or the guessed one; None: the datum does not fit it.
+    """
+    part = part_at(value, shows.of)
+    kinds = shows.kinds or (guess(value),)
+    return {kind: _KINDS[kind](part, shows) for kind in kinds}
+
+
+def _image(part: object, shows: Shows) -> ShownImage | None:
+    array = next((array for array, _ in arrays_of(part) if is_image(array)), None)
+    if array is None:
+        return None
+    channels = array.shape[2] if array.ndim == 3 else 2
+    kind = array.dtype.kind + str(array.dtype.itemsize)
+    return ShownImage(array, shows.encoding or _BY_SHAPE[kind, channels])
+
+
+def _mask(part: object, _: Shows) -> ShownImage | None:
+    for array, beside in arrays_of(part):
+        if array.ndim == 2 and array.dtype.kind + str(array.dtype.itemsize) in ("b1", "u1"):
+            if array is beside.get("packed"):
+                array = np.unpackbits(array, axis=1)  # noqa: PLW2901 - bits for pixels
+            return ShownImage(np.where(array != 0, np.uint8(255), np.uint8(0)), "mono8")
+    return None
+
+
+def _point_cloud(part: object, _: Shows) -> ShownCloud | None:
+    for array, beside in arrays_of(part):
+        if is_points(array):
+            return ShownCloud(array, array_beside(beside, "u", len(array)))
+    return None
+
+
+def _mesh(part: object, _: Shows) -> ShownMesh | None:
+    for array, beside in arrays_of(part):
+        triangles = array_beside(beside, "iu") if is_points(array) else None
+        if triangles is not None:
+            return ShownMesh(array, triangles)
+    return None
+
+
+def _voxels(part: object, shows: Shows) -> ShownVoxels | None:
+    for array, beside in arrays_of(part):
+        if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "iu":
+            continue
+        voxel_m = number_of(beside.get("voxel_m")) or shows.voxel_m
+        origin_m = beside.get("origin_m")
+        if not isinstance(origin_m, np.ndarray) or origin_m.dtype.kind not in "fiu":
+            origin_m = np.array(shows.origin_m)
+        if not voxel_m or origin_m.shape != (3,):
+            return None
+        return ShownVoxels(array, voxel_m, origin_m)
+    return None
+
+
+def _capsules(part: object, _: Shows) -> ShownCapsules | None:
+    for array, _beside in arrays_of(part):
+        if array.ndim == 2 and array.shape[1] == 7 and array.dtype.kind == "f":
+            return ShownCapsules(tuple(map(capsule_of, array[np.isfinite(array).all(axis=1)])))
+    return None
+
+
+def _joints(part: object, shows: Shows) -> ShownJoints | None:
+    for array, beside in arrays_of(part):
+        if array.dtype.kind != "f" or array.ndim not in (1, 2) or not array.size:
+            continue
+        names = shows.joints or tuple(f"joint_{at + 1}" for at in range(array.shape[-1]))
+        if len(names) != array.shape[-1]:
+            return None
+        alike = [
+            other
+            for other in beside.values()
+            if isinstance(other, np.ndarray)
+            and other is not array
+            and (other.shape, other.dtype.kind) == (array.shape, "f")
+        ]
+        speeds = np.atleast_2d(alike[0])[-1] if alike else None
+        return ShownJoints(names, np.atleast_2d(array)[-1], speeds)
+    return None
+
+
+def _rigid(part: object) -> NDArray[Any] | None:
+    return next((array for array, _ in arrays_of(part) if is_rigid(array)), None)
+
+
+def _pose(part: object, _: Shows) -> ShownPose | None:
+    matrix = _rigid(part)
+    return ShownPose(matrix) if matrix is not None else None
+
+
+def _transform(part: object, shows: Shows) -> ShownTransform | None:
+    matrix = _rigid(part)
+    if matrix is None:
+        return None
+    return ShownTransform(np.linalg.inv(matrix) if shows.inverse else matrix)
+
+
+def _calibration(part: object, _: Shows) -> ShownCamera | None:
+    cameras = (_pinhole(found.value) for found in parts_of(part, {}))
+    return next((camera for camera in cameras if camera is not None), None)
+
+
+def _pinhole(value: object) -> ShownCamera | None:
+    if not isinstance(value, dict):
+        return None
+    if all(name in value for name in _CAMERA):
+        width, height, fx, fy, cx, cy = (number_of(value[name]) for name in _CAMERA)
+        pinhole = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+        return ShownCamera(int(width), int(height), pinhole, [])
+    matrix, distortion = value.get("camera_matrix"), value.get("distortion")
+    width, height = number_of(value.get("width")), number_of(value.get("height"))
+    if isinstance(matrix, np.ndarray) and matrix.shape == (3, 3) and matrix.dtype.kind == "f":
+        coefficients: list[float] = []
+        if isinstance(distortion, np.ndarray) and distortion.dtype.kind == "f":
+            coefficients = distortion.ravel().tolist()
+        return ShownCamera(int(width), int(height), matrix.astype(np.float64), coefficients)
+    return None
+
+
+def _plain(part: object, _: Shows) -> ShownPlain:
+    return ShownPlain(part)
+
+
+_KINDS: Final[dict[str, Callable[[object, Shows], Drawable | None]]] = {
+    "image": _image,
+    "mask": _mask,
+    "point_cloud": _point_cloud,
+    "mesh": _mesh,
+    "voxels": _voxels,
+    "capsules": _capsules,
+    "joints": _joints,
+    "pose": _pose,
+    "transform": _transform,
+    "calibration": _calibration,
+    "json": _plain,
+}
