@@ -66,6 +66,7 @@ NOUNS: Final = {
         "commit a recording into a cell again, at its pace; or run one step of an actor again",
         "recordings",
     ),
+    "view": Noun("view", "show a cell, or a recording, in the browser until Ctrl-C", "view"),
     "lock": Noun("lock", "list locks, hold one, break one, resolve one", "guide"),
     "top": Noun(
         "top",

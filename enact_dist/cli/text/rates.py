@@ -157,6 +157,11 @@ class Rates:
         """Count one change more."""
         self._slots.setdefault(slot, SlotRates()).add(sample, now_s)
 
+    def of(self, slot: Slot, now_s: float) -> Tally:
+        """Return the figures of the last `WINDOW_S` of one slot."""
+        rates = self._slots.get(slot)
+        return rates.recent(now_s) if rates is not None else Tally()
+
     def recent(self, now_s: float) -> dict[Slot, Tally]:
         """Return the figures of the last `WINDOW_S`, by slot."""
         return {slot: self._slots[slot].recent(now_s) for slot in sorted(self._slots)}

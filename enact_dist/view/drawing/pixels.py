@@ -1,0 +1,55 @@
+"""Images as a browser shows them: small, red green blue, with masks over them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from enact_dist.recording.drawing.drawables import ShownImage
+
+SIDE_PX_MAX: Final = 320
+"""Longest side of an image in the scene."""
+MASK_COLOUR: Final = np.array((255, 50, 30), np.uint16)
+
+
+def rgb_of(shown: ShownImage, side_px_max: int = SIDE_PX_MAX) -> NDArray[np.uint8]:
+    """Return an image as (H, W, 3) uint8, red green blue.
+
+    Args:
+        shown: The image; numbers that are no bytes go from black (smallest) to white (largest).
+        side_px_max: Longest side; every n-th pixel of a larger image is taken.
+    """
+    step = max(1, -(-max(shown.pixels.shape[:2]) // side_px_max))
+    pixels = shown.pixels[::step, ::step]
+    if pixels.ndim == 3:
+        order = [2, 1, 0] if shown.encoding.startswith("bgr") else [0, 1, 2]
+        return np.ascontiguousarray(pixels[:, :, order])
+    if pixels.dtype != np.uint8:
+        pixels = _as_bytes(pixels)
+    return np.repeat(pixels[:, :, None], 3, axis=2)
+
+
+def _as_bytes(pixels: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return numbers as bytes; what is not finite, and 0 (no measurement), is black."""
+    values = np.asarray(pixels, np.float32)
+    there = np.isfinite(values) & (values != 0.0)
+    found = np.zeros(values.shape, np.uint8)
+    if there.any():
+        low, high = float(values[there].min()), float(values[there].max())
+        span = high - low or 1.0
+        found[there] = (30.0 + 225.0 * (values[there] - low) / span).astype(np.uint8)
+    return found
+
+
+def with_mask(image: NDArray[np.uint8], mask: ShownImage) -> NDArray[np.uint8]:
+    """Return an image with what a mask covers in red; a mask of another shape is left out."""
+    covers = rgb_of(mask, max(image.shape[:2]))[:, :, 0] > 0
+    if covers.shape != image.shape[:2]:
+        return image
+    found = image.copy()
+    found[covers] = ((image[covers].astype(np.uint16) + MASK_COLOUR) // 2).astype(np.uint8)
+    return found

@@ -1,0 +1,396 @@
+"""What stands in the scene: the data of one moment as nodes, each in its frame."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+
+from enact_dist.recording.drawing.drawables import (
+    ShownCamera,
+    ShownCapsules,
+    ShownCloud,
+    ShownImage,
+    ShownMesh,
+    ShownPose,
+    ShownTransform,
+    ShownVoxels,
+    drawables_of,
+)
+from enact_dist.view.drawing.frames import InParent, placed
+from enact_dist.view.drawing.pixels import rgb_of, with_mask
+from enact_dist.wire.payload import decode_untyped
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+
+    from numpy.typing import NDArray
+
+    from enact_dist.config.shows import Shows
+    from enact_dist.core.protocol.datum import Slot
+    from enact_dist.recording.drawing.drawables import Drawable
+    from enact_dist.recording.drawing.solids import Capsule
+    from enact_dist.recording.exact import Recorded
+
+    Colour = tuple[int, int, int]
+
+POINTS_MAX: Final = 100_000
+"""Points of a larger cloud are thinned; the page says so."""
+TRIANGLES_MAX: Final = 300_000
+CUBES_MAX: Final = 20_000
+"""More voxels than this are drawn as square points."""
+FRUSTUMS_MAX: Final = 4
+"""Pictures that one image makes: with masks of different versions, in the colours of pages."""
+FIELD_RAD: Final = math.radians(50.0)
+"""Vertical field of an image whose camera is not known."""
+IN_SCENE: Final = frozenset(
+    ("image", "mask", "point_cloud", "mesh", "voxels", "capsules", "pose", "transform",
+     "calibration")
+)  # fmt: skip
+"""Kinds of `enact_dist.config.shows` that the scene shows; the others are values in the tree."""
+CLOUD_COLOUR: Final = (60, 90, 140)
+MESH_COLOUR: Final = (170, 172, 180)
+VOXEL_COLOUR: Final = (242, 140, 38)
+CAPSULE_COLOUR: Final = (64, 128, 217)
+FRUSTUM_COLOUR: Final = (40, 40, 40)
+
+
+@dataclass(eq=False, slots=True)
+class Shown:
+    """One version of a datum and what can be shown of it.
+
+    Attributes:
+        recorded: The version.
+        value: The datum, decoded without its type; None if it is null.
+        shows: What its aspect is shown as.
+        drawables: By kind; None: the datum does not fit it.
+        made: Nodes and small images made of it, so that several pages share them.
+    """
+
+    recorded: Recorded
+    value: object
+    shows: Shows
+    drawables: dict[str, Drawable | None]
+    made: dict[object, Any] = field(default_factory=dict)
+
+
+def shown_of(recorded: Recorded, shows: Shows) -> Shown:
+    """Return what can be shown of a version.
+
+    Raises:
+        ProtocolError: The datum cannot be decoded.
+    """
+    if recorded.datum is None:
+        return Shown(recorded, None, shows, {})
+    value = decode_untyped(recorded.datum)
+    return Shown(recorded, value, shows, drawables_of(value, shows))
+
+
+# ---------------------------------------------------------------- nodes
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Node:
+    """A thing in the scene, in the coordinates of its frame; the same object is drawn once."""
+
+    frame: str
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PointsNode(Node):
+    """Points (N, 3), metres, with one colour, or (N, 3) uint8; as squares of `size_m`, or round."""
+
+    points_m: NDArray[np.float32]
+    colours: NDArray[np.uint8] | Colour
+    size_m: float = 0.0
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class SurfaceNode(Node):
+    """Triangles (M, 3) over vertices (N, 3), metres."""
+
+    vertices_m: NDArray[np.float32]
+    triangles: NDArray[np.uint32]
+    colour: Colour
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class CubesNode(Node):
+    """Cubes with an edge of `edge_m` around centres (N, 3)."""
+
+    centres_m: NDArray[np.float32]
+    edge_m: float
+    colour: Colour
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class CapsulesNode(Node):
+    """Capsules, at least one."""
+
+    capsules: tuple[Capsule, ...]
+    colour: Colour
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class AxesNode(Node):
+    """Axes at a rigid (4, 4)."""
+
+    matrix: NDArray[Any]
+    colour: Colour | None = None
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TrailNode(Node):
+    """A line through places (N, 3), N > 1."""
+
+    places_m: NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class FrustumNode(Node):
+    """A camera, looking along z, with its image (H, W, 3) uint8 or without one."""
+
+    field_rad: float
+    aspect: float
+    image: NDArray[np.uint8] | None
+    colour: Colour
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class LabelNode(Node):
+    """A text at a place (3,)."""
+
+    text: str
+    place_m: NDArray[np.float64]
+
+
+class SceneView(NamedTuple):
+    """The scene of a moment.
+
+    Attributes:
+        nodes: By a name that stays the same from one moment to the next.
+        frames: (4, 4) of each frame that a node stands in, and of those with a transform.
+        remarks: What the viewer has to know: thinned clouds, frames without a common parent.
+    """
+
+    nodes: dict[str, Node]
+    frames: dict[str, NDArray[np.float64]]
+    remarks: tuple[str, ...]
+
+
+def scene_of(
+    data: Mapping[Slot, Shown],
+    *,
+    tints: Mapping[Slot, Colour] | None = None,
+    frames_of: Mapping[Slot, Shown] | None = None,
+) -> SceneView:
+    """Return the scene of the data of one moment.
+
+    Args:
+        data: The data that are to be drawn.
+        tints: Colours of data in place of their own.
+        frames_of: Data whose transforms hold where `data` have none.
+    """
+    tints = tints or {}
+    nodes: dict[str, Node] = {}
+    remarks: list[str] = []
+    transforms = dict(_transforms([*(frames_of or {}).values(), *data.values()]))
+    for slot, shown in data.items():
+        tint = tints.get(slot)
+        for kind, drawable in shown.drawables.items():
+            made = _made(shown, kind, drawable, tint)
+            if made is not None:
+                nodes[f"{slot}#{kind}"] = made
+            remarks += _thinned(slot, drawable)
+    for frame, frustum in _frustums(data, tints).items():
+        nodes[f"camera {frame}"] = frustum
+    asked = dict.fromkeys([*(node.frame for node in nodes.values()), *transforms])
+    frames = placed(transforms, asked)
+    if len(frames.roots) > 1:
+        named = ", ".join(frames.roots[:6]) + (", …" if frames.roots[6:] else "")
+        remarks.append(f"no transform joins the frames {named}: all stand at the origin")
+    if frames.circular:
+        remarks.append(f"transforms of {', '.join(frames.circular)} go round in a circle")
+    return SceneView(nodes, frames.poses, tuple(remarks))
+
+
+def _transforms(data: Iterable[Shown]) -> Iterator[tuple[str, InParent]]:
+    for shown in data:
+        found, entity = shown.drawables.get("transform"), shown.recorded.slot.entity
+        if isinstance(found, ShownTransform):
+            parent = shown.shows.parent_of(entity)
+            yield shown.shows.frame_of(entity), InParent(parent, found.matrix)
+
+
+def _made(shown: Shown, kind: str, drawable: Drawable | None, tint: Colour | None) -> Node | None:
+    """Return the node of a drawable, made once; None if it is none, or empty."""
+    key = ("node", kind, tint)
+    if key not in shown.made:
+        frame = shown.shows.frame_of(shown.recorded.slot.entity)
+        shown.made[key] = _node(frame, drawable, tint)
+    node: Node | None = shown.made[key]
+    return node
+
+
+def _node(frame: str, drawable: Drawable | None, tint: Colour | None) -> Node | None:
+    if isinstance(drawable, ShownCloud):
+        return _points(frame, drawable, tint)
+    if isinstance(drawable, ShownMesh):
+        vertices = np.asarray(drawable.vertices_m, np.float32)
+        triangles = drawable.triangles[:TRIANGLES_MAX]
+        fits = (triangles >= 0).all(axis=1) & (triangles < len(vertices)).all(axis=1)
+        triangles = triangles[fits].astype(np.uint32)
+        if not len(triangles) or not np.isfinite(vertices).all():
+            return None
+        return SurfaceNode(frame, vertices, triangles, tint or MESH_COLOUR)
+    if isinstance(drawable, ShownVoxels):
+        if not len(drawable.indices):
+            return None
+        middles = drawable.origin_m + drawable.voxel_m * (drawable.indices + 0.5)
+        centres = middles.astype(np.float32)
+        colour = tint or VOXEL_COLOUR
+        if len(centres) > CUBES_MAX:
+            return PointsNode(frame, centres[:: _stride(len(centres))], colour, drawable.voxel_m)
+        return CubesNode(frame, centres, drawable.voxel_m, colour)
+    if isinstance(drawable, ShownCapsules) and drawable.capsules:
+        return CapsulesNode(frame, drawable.capsules, tint or CAPSULE_COLOUR)
+    if isinstance(drawable, ShownPose):
+        return AxesNode(frame, drawable.matrix, tint)
+    return None
+
+
+def _stride(count: int) -> int:
+    return -(-count // POINTS_MAX)
+
+
+def _points(frame: str, cloud: ShownCloud, tint: Colour | None) -> PointsNode | None:
+    step = max(1, _stride(len(cloud.points_m)))
+    with np.errstate(over="ignore"):
+        points = np.asarray(cloud.points_m[::step], np.float32)
+    there = np.isfinite(points).all(axis=1)
+    if not there.any():
+        return None
+    if tint is not None or cloud.colours is None:
+        return PointsNode(frame, points[there], tint or CLOUD_COLOUR)
+    return PointsNode(frame, points[there], np.ascontiguousarray(cloud.colours[::step][there]))
+
+
+def _thinned(slot: Slot, drawable: Drawable | None) -> Iterator[str]:
+    count = len(drawable.points_m) if isinstance(drawable, ShownCloud) else 0
+    count = len(drawable.indices) if isinstance(drawable, ShownVoxels) else count
+    if count > POINTS_MAX:
+        yield f"{slot} has {count} points; one in {_stride(count)} is shown"
+    if isinstance(drawable, ShownMesh) and len(drawable.triangles) > TRIANGLES_MAX:
+        yield f"{slot} has {len(drawable.triangles)} triangles; {TRIANGLES_MAX} are shown"
+
+
+# ---------------------------------------------------------------- cameras
+
+
+@dataclass(eq=False, slots=True)
+class _Camera:
+    """What is known of the camera of a frame."""
+
+    image: Shown | None = None
+    masks: list[Shown] = field(default_factory=list)
+    calibration: Shown | None = None
+    tint: Colour | None = None
+
+
+def _frustums(data: Mapping[Slot, Shown], tints: Mapping[Slot, Colour]) -> dict[str, FrustumNode]:
+    cameras: dict[str, _Camera] = {}
+    for slot, shown in data.items():
+        frame = shown.shows.frame_of(slot.entity)
+        for kind, drawable in shown.drawables.items():
+            if not isinstance(drawable, ShownImage | ShownCamera):
+                continue
+            camera = cameras.setdefault(frame, _Camera())
+            camera.tint = tints.get(slot, camera.tint)
+            if kind == "image":
+                camera.image = shown
+            elif kind == "mask":
+                camera.masks.append(shown)
+            else:
+                camera.calibration = shown
+    return {frame: _frustum(frame, camera) for frame, camera in cameras.items()}
+
+
+def _frustum(frame: str, camera: _Camera) -> FrustumNode:
+    parts = [one for one in (camera.image, *camera.masks, camera.calibration) if one is not None]
+    made, key = parts[0].made, ("frustum", camera.tint, *map(id, parts[1:]))
+    if key not in made:
+        older = [each for each in made if isinstance(each, tuple) and each[0] == "frustum"]
+        for each in older[: 1 - FRUSTUMS_MAX]:
+            del made[each]
+        # The parts stay referenced with the node, so that their ids stay theirs.
+        made[key] = _new_frustum(frame, camera), parts[1:]
+    node: FrustumNode = made[key][0]
+    return node
+
+
+def _new_frustum(frame: str, camera: _Camera) -> FrustumNode:
+    image = None
+    pictures = [(camera.image, "image")] + [(mask, "mask") for mask in camera.masks]
+    for shown, kind in pictures:
+        drawable = shown.drawables[kind] if shown is not None else None
+        if isinstance(drawable, ShownImage) and drawable.pixels.size:
+            image = rgb_of(drawable) if image is None else with_mask(image, drawable)
+    pinhole = camera.calibration and camera.calibration.drawables["calibration"]
+    if isinstance(pinhole, ShownCamera) and pinhole.matrix[1, 1] > 0 and pinhole.height_px > 0:
+        field_rad = 2.0 * math.atan(pinhole.height_px / (2.0 * pinhole.matrix[1, 1]))
+        aspect = pinhole.width_px / pinhole.height_px
+    else:
+        shape = image.shape if image is not None else (3, 4)
+        field_rad, aspect = FIELD_RAD, shape[1] / shape[0]
+    return FrustumNode(frame, field_rad, aspect or 1.0, image, camera.tint or FRUSTUM_COLOUR)
+
+
+# ---------------------------------------------------------------- extent, labels
+
+
+def extent_of(scene: SceneView) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Return the lowest and the highest corner (3,) of a scene, metres; None if it is empty."""
+    corners = []
+    for node in scene.nodes.values():
+        places = _places(node)
+        pose = scene.frames.get(node.frame, np.eye(4))
+        corners.append(places @ pose[:3, :3].T + pose[:3, 3])
+    if not corners:
+        return None
+    every = np.concatenate(corners)
+    return every.min(axis=0), every.max(axis=0)
+
+
+def _places(node: Node) -> NDArray[np.float64]:
+    """Return corners (N, 3) of what a node covers, in its frame."""
+    if isinstance(node, CapsulesNode):
+        found = np.concatenate([capsule.ends_m for capsule in node.capsules])
+    elif isinstance(node, PointsNode):
+        found = np.asarray(node.points_m, np.float64)
+    elif isinstance(node, SurfaceNode):
+        found = np.asarray(node.vertices_m, np.float64)
+    elif isinstance(node, CubesNode):
+        found = np.asarray(node.centres_m, np.float64)
+    elif isinstance(node, AxesNode):
+        return np.asarray(node.matrix[None, :3, 3], np.float64)
+    else:
+        return np.zeros((1, 3))
+    return np.stack((found.min(axis=0), found.max(axis=0)))
+
+
+def labels_of(scene: SceneView, texts: Mapping[str, str]) -> dict[str, LabelNode]:
+    """Return a label for each entity that has a text and a node: at the middle of its first node.
+
+    Args:
+        scene: Where the entities are.
+        texts: By entity.
+    """
+    found: dict[str, LabelNode] = {}
+    for name, node in scene.nodes.items():
+        entity = name.partition(":")[2].partition("#")[0].rpartition("/")[0]
+        if entity in texts and f"label {entity}" not in found:
+            middle = _places(node).mean(axis=0)
+            found[f"label {entity}"] = LabelNode(node.frame, texts[entity], middle)
+    return found

@@ -1,0 +1,239 @@
+"""The present of a cell for all pages: one watch, and the newest data that some page shows.
+
+The watch is open while a page is.  Of a slot that changes faster than pages are drawn only the
+newest version is fetched, and no more bytes than the limit; what is passed over is counted.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.access.watch import Watch
+from enact_dist.core.protocol.datum import Slot
+from enact_dist.errors import EnactError, ProtocolError, ShardUnreachableError
+from enact_dist.view.catalogue import Catalogue, ListedState
+from enact_dist.view.drawing.scene import IN_SCENE, Shown, shown_of
+from enact_dist.view.source import RETRIED
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from enact_dist.config.shows import Shows
+    from enact_dist.recording.exact import Recorded
+    from enact_dist.view.source import CellSource
+
+AGAIN_S: Final = 1.0
+"""Pause before a shard that did not answer is asked again."""
+PROBED_MAX: Final = 16
+"""Aspects without `shows` whose first datum is looked at in one round."""
+
+
+class Feed:
+    """The thread that follows a cell.
+
+    Args:
+        source: The cell.
+        shows_of: What an aspect is shown as.
+        rate_hz: Most rounds per second.
+        bytes_s: Most bytes that are fetched per second.
+
+    Attributes:
+        catalogue: All slots.
+        passed_over: Versions of shown slots that were not fetched.
+        held_back: Rounds in which data waited because of the limit of bytes.
+        round_s: Processor time of the last round.
+        moment_ns: The moment of the newest data.
+    """
+
+    def __init__(
+        self,
+        source: CellSource,
+        shows_of: Callable[[str], Shows],
+        *,
+        rate_hz: float,
+        bytes_s: float,
+    ) -> None:
+        self._source, self.shows_of = source, shows_of
+        self._rate_hz, self._bytes_s = rate_hz, bytes_s
+        self.catalogue = Catalogue()
+        self._trouble: dict[str, str] = {}
+        self.passed_over = self.held_back = 0
+        self.round_s = 0.0
+        self.moment_ns = 0
+        self._kinds: dict[str, frozenset[str]] = {}
+        self._shown: dict[Slot, Shown] = {}
+        self._wishes: dict[object, frozenset[Slot]] = {}
+        self._away: dict[str, float] = {}
+        self._budget, self._budget_s = bytes_s, time.monotonic()
+        self._news = threading.Condition()
+        self._stopped = False
+        self._thread = threading.Thread(target=self._run, name="view feed", daemon=True)
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End; twice is harmless."""
+        with self._news:
+            self._stopped = True
+            self._news.notify_all()
+        if self._thread.ident is not None:
+            self._thread.join()
+
+    # ------------------------------------------------------------ for pages
+
+    @property
+    def problem(self) -> str:
+        """Why data are missing or old; "" if nothing is wrong."""
+        return "; ".join(self._trouble.copy().values())
+
+    def wish(self, page: object, slots: Iterable[Slot] | None) -> None:
+        """Set which data a page shows; None: the page has gone."""
+        with self._news:
+            if slots is None:
+                self._wishes.pop(page, None)
+            else:
+                self._wishes[page] = frozenset(slots)
+            self._news.notify_all()
+
+    def shown(self, slots: Iterable[Slot]) -> dict[Slot, Shown]:
+        """Return the newest data of some slots, as far as they have come."""
+        with self._news:
+            return {slot: self._shown[slot] for slot in slots if slot in self._shown}
+
+    def kinds(self, aspect: str) -> frozenset[str] | None:
+        """Return as what an aspect's data are shown; None: not known yet."""
+        declared = self.shows_of(aspect).kinds
+        return frozenset(declared) if declared else self._kinds.get(aspect)
+
+    def in_scene(self, slots: Iterable[Slot]) -> list[Slot]:
+        """Return the slots that the scene can show."""
+        return [slot for slot in slots if IN_SCENE & (self.kinds(slot.aspect) or frozenset())]
+
+    # ------------------------------------------------------------ the thread
+
+    def _run(self) -> None:
+        while self._waits_for_pages():
+            try:
+                with Watch(self._source.session.client, (), ("**",), ()) as watch:
+                    self._follow(watch)
+            except EnactError as error:
+                self._trouble[""] = str(error)
+                with self._news:
+                    self._news.wait_for(lambda: self._stopped, AGAIN_S)
+
+    def _waits_for_pages(self) -> bool:
+        with self._news:
+            self._news.wait_for(lambda: self._stopped or self._wishes)
+            return not self._stopped
+
+    def _follow(self, watch: Watch) -> None:
+        due_s = 0.0
+        while not self._stopped and self._wishes:
+            now_s = time.monotonic()
+            if now_s >= due_s:
+                begun_s = time.thread_time()
+                self._round(now_s)
+                self.round_s = time.thread_time() - begun_s
+                # At most half of the time is spent here, however large the data are.
+                due_s = now_s + max(1.0 / self._rate_hz, 2.0 * (time.monotonic() - now_s))
+            self._take(watch, max(0.0, due_s - time.monotonic()))
+
+    def _take(self, watch: Watch, wait_s: float) -> None:
+        change = watch.next(wait_s)
+        now_s = time.monotonic()
+        while change is not None:
+            slot = Slot(change.world, change.entity.name, change.aspect)
+            state = ListedState(
+                change.version, change.position.stamp_ns, change.null, change.captured_ns
+            )
+            self.catalogue.note(slot, state, gap=change.gap, now_s=now_s)
+            change = watch.next_here()
+
+    def _round(self, now_s: float) -> None:
+        """Fetch what has changed."""
+        with self._news:
+            wanted = frozenset().union(*self._wishes.values())
+            for slot in [slot for slot in self._shown if slot not in wanted]:
+                del self._shown[slot]
+        probes = self._probes()
+        changed = [slot for slot in wanted if self._is_new(slot)]
+        asked = [slot for slot in {*changed, *probes} if self._may_ask(slot, now_s)]
+        affordable = self._affordable(asked, now_s)
+        if affordable:
+            self._fetch(affordable, now_s)
+
+    def _is_new(self, slot: Slot) -> bool:
+        state, shown = self.catalogue.state(slot), self._shown.get(slot)
+        if state is None:
+            return False
+        if shown is None:
+            return not state.null
+        return (shown.recorded.version, shown.recorded.stamp_ns) != state[:2]
+
+    def _probes(self) -> list[Slot]:
+        """Return one datum of each aspect whose kinds have to be guessed."""
+        found: dict[str, Slot] = {}
+        for slot in self.catalogue.first_of_aspects():
+            if self.kinds(slot.aspect) is None and len(found) < PROBED_MAX:
+                found.setdefault(slot.aspect, slot)
+        return list(found.values())
+
+    def _may_ask(self, slot: Slot, now_s: float) -> bool:
+        return self._away.get(self._shard_of(slot), 0.0) <= now_s
+
+    def _shard_of(self, slot: Slot) -> str:
+        return self._source.session.client.shard_of(slot.entity)
+
+    def _affordable(self, slots: list[Slot], now_s: float) -> list[Slot]:
+        """Return the slots for which the limit of bytes has room; a datum's size is its last one.
+
+        Those that were fetched longest ago come first, so that each has its turn.
+        """
+        self._budget = min(self._bytes_s, self._budget + self._bytes_s * (now_s - self._budget_s))
+        self._budget_s = now_s
+        found = []
+        for slot in sorted(slots, key=self._fetched_ns):
+            if self._budget <= 0.0:
+                self.held_back += 1
+                break
+            shown = self._shown.get(slot)
+            self._budget -= shown.recorded.size if shown is not None else 0
+            found.append(slot)
+        return found
+
+    def _fetched_ns(self, slot: Slot) -> int:
+        shown = self._shown.get(slot)
+        return shown.recorded.stamp_ns if shown is not None else 0
+
+    def _fetch(self, slots: list[Slot], now_s: float) -> None:
+        at_ns = self.catalogue.newest_ns
+        try:
+            found = self._source.data_at(slots, at_ns)
+        except ShardUnreachableError as error:
+            self._trouble[error.shard] = str(error)
+            self._away[error.shard] = time.monotonic() + AGAIN_S
+            return
+        except RETRIED:
+            return
+        for shard in {"", *map(self._shard_of, slots)}:
+            self._trouble.pop(shard, None)
+        with self._news:
+            for slot, recorded in found.data.items():
+                self._show(slot, recorded)
+            self.moment_ns = at_ns
+            self._news.notify_all()
+
+    def _show(self, slot: Slot, recorded: Recorded) -> None:
+        before = self._shown.get(slot)
+        if before is not None and recorded.version > before.recorded.version + 1:
+            self.passed_over += recorded.version - before.recorded.version - 1
+        with contextlib.suppress(ProtocolError):
+            shown = shown_of(recorded, self.shows_of(slot.aspect))
+            if not shown.shows.kinds and recorded.datum is not None:
+                self._kinds[slot.aspect] = frozenset(shown.drawables)
+            self._shown[slot] = shown

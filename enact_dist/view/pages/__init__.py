@@ -1,0 +1,1 @@
+"""What a browser shows and does: the only part that knows viser."""

@@ -1,0 +1,194 @@
+"""The data of one page: which it shows, and as of which moment."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, Protocol
+
+from enact_dist.view.drawing.scene import SceneView, Shown, labels_of, scene_of, shown_of
+from enact_dist.view.drawing.trails import Trails
+from enact_dist.view.markup import short_value
+from enact_dist.view.pages.comparing import Comparing, Side
+from enact_dist.view.timeline import Player, Timeline
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+
+    from enact_dist.compare.diff import Diff
+    from enact_dist.config.shows import Shows
+    from enact_dist.core.protocol.datum import Slot
+    from enact_dist.view.catalogue import Catalogue
+    from enact_dist.view.source import DataSource
+
+SCENE_MAX: Final = 256
+"""Most data in one scene."""
+OTHERS_MAX: Final = 64
+"""Most data of the right side of a difference that are drawn."""
+
+
+class Present(Protocol):
+    """What pages ask of a feed."""
+
+    catalogue: Catalogue
+    shows_of: Callable[[str], Shows]
+    moment_ns: int
+    passed_over: int
+    held_back: int
+
+    @property
+    def problem(self) -> str:
+        """Why data are missing or old."""
+
+    def wish(self, page: object, slots: Iterable[Slot] | None) -> None:
+        """Set which data a page shows."""
+
+    def shown(self, slots: Iterable[Slot]) -> dict[Slot, Shown]:
+        """Return the newest data of some slots."""
+
+    def in_scene(self, slots: Iterable[Slot]) -> list[Slot]:
+        """Return the slots that the scene can show."""
+
+
+class Contents:
+    """What one page shows.  Used by one thread.
+
+    Args:
+        feed: The present.
+        source: The past.
+        compare: Returns how two sides differ.
+
+    Attributes:
+        world: The world context that is shown.
+        player: The moment.
+        marked_ns: The marked moment; 0: none.
+        hidden: Aspects that are not drawn.
+        label: The aspect whose data stand as labels beside their entities; "": none.
+        trails: Whether poses leave trails.
+        comparing: The difference that is shown.
+        forgotten: Data that have left their retention at the moment.
+        left_out: Data that are not drawn because there are too many.
+    """
+
+    def __init__(
+        self, feed: Present, source: DataSource, compare: Callable[[Side, Side], Diff]
+    ) -> None:
+        self._feed, self._source = feed, source
+        self.world = ""
+        self.player = Player()
+        self.marked_ns = 0
+        self.hidden: set[str] = set()
+        self.label = ""
+        self.trails = True
+        self.comparing = Comparing(compare)
+        self.forgotten: tuple[Slot, ...] = ()
+        self.left_out = 0
+        self._trails = Trails()
+        self._past: dict[Slot, Shown] = {}
+        self._past_key: tuple[object, ...] = ()
+        self._others: dict[Slot, Shown] = {}
+        self._others_key: object = None
+
+    @property
+    def at_ns(self) -> int:
+        """The moment that is shown."""
+        return self._feed.moment_ns if self.player.live else self.player.at_ns
+
+    def drawable(self) -> list[Slot]:
+        """Return the data of the world context that a scene can show, hidden ones too."""
+        return self._feed.in_scene(self._feed.catalogue.slots(self.world))
+
+    def drawn(self, drawable: Iterable[Slot]) -> list[Slot]:
+        """Return the data to draw of those that a scene can show."""
+        found = [slot for slot in drawable if slot.aspect not in self.hidden]
+        self.left_out = max(0, len(found) - SCENE_MAX)
+        return found[:SCENE_MAX]
+
+    def labelled(self) -> list[Slot]:
+        """Return the data that are labels."""
+        if not self.label:
+            return []
+        slots = self._feed.catalogue.slots(self.world)
+        return [slot for slot in slots if slot.aspect == self.label][:SCENE_MAX]
+
+    def look_back(self, slots: Sequence[Slot], at_ns: int = 0) -> None:
+        """Leave the present, for a moment (0: the newest one) of the history of some data.
+
+        Raises:
+            ShardUnreachableError: A shard does not answer.
+        """
+        timeline = Timeline.of(self._source.histories(slots))
+        self.player.look_back(timeline.including([at_ns]) if at_ns else timeline, at_ns)
+
+    def data(self, slots: Sequence[Slot]) -> dict[Slot, Shown]:
+        """Return data as of the moment.
+
+        Raises:
+            ShardUnreachableError: A shard does not answer.
+        """
+        if self.player.live:
+            self.forgotten = ()
+            return self._feed.shown(slots)
+        key = (self.player.at_ns, frozenset(slots))
+        if key != self._past_key:
+            self._past, self.forgotten = self._as_of(slots, self.player.at_ns, self._past)
+            self._past_key = key
+        return self._past
+
+    def _as_of(
+        self, slots: Sequence[Slot], at_ns: int, before: dict[Slot, Shown]
+    ) -> tuple[dict[Slot, Shown], tuple[Slot, ...]]:
+        """Return data as of a moment; of a version that was shown before, the same object."""
+        found = self._source.data_at(slots, at_ns)
+        shown: dict[Slot, Shown] = {}
+        for slot, recorded in found.data.items():
+            old = before.get(slot)
+            same = old is not None and (old.recorded.version, old.recorded.stamp_ns) == (
+                recorded.version,
+                recorded.stamp_ns,
+            )
+            shown[slot] = (
+                old
+                if old is not None and same
+                else shown_of(recorded, self._feed.shows_of(slot.aspect))
+            )
+        return shown, found.forgotten
+
+    def scenes(self, data: dict[Slot, Shown]) -> dict[str, SceneView]:
+        """Return the scene of the moment and, of a difference, what the other side has.
+
+        Raises:
+            ShardUnreachableError: A shard does not answer.
+        """
+        left = Side(self.world, self.at_ns)
+        self.comparing.look(
+            left, live=self.player.live, now_ns=self._now_ns(), marked_ns=self.marked_ns
+        )
+        tints = {slot: tint for slot in data if (tint := self.comparing.tint(slot))}
+        scene = scene_of(data, tints=tints)
+        nodes = dict(scene.nodes)
+        if self.trails:
+            nodes |= self._trails.follow(scene.nodes, self.at_ns)
+        scenes = {"": scene}
+        others = {
+            slot: tint
+            for slot, tint in self.comparing.right_tints().items()
+            if slot.aspect not in self.hidden
+        }
+        wanted = self._feed.in_scene(others)[:OTHERS_MAX]
+        if wanted:
+            key = (self.comparing.right, tuple(wanted))
+            if key != self._others_key:
+                at_ns = self.comparing.right.at_ns
+                self._others, _ = self._as_of(wanted, at_ns, self._others)
+                self._others_key = key
+            scenes["right "] = scene_of(self._others, tints=others, frames_of=data)
+        texts = self.comparing.texts() | {
+            slot.entity: f"{slot.aspect}: {short_value(shown.value)}"
+            for slot, shown in data.items()
+            if slot.aspect == self.label
+        }
+        nodes |= labels_of(scene, texts)
+        scenes[""] = scene._replace(nodes=nodes)
+        return scenes
+
+    def _now_ns(self) -> int:
+        return self._feed.catalogue.newest_ns

@@ -1,0 +1,422 @@
+"""One browser's page: takes its events, shows its contents, at a bounded rate, in one thread."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections import deque
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from enact_dist.errors import EnactError
+from enact_dist.view import markup
+from enact_dist.view.drawing.scene import extent_of
+from enact_dist.view.pages.canvas import Canvas
+from enact_dist.view.pages.comparing import MARKED, NOW
+from enact_dist.view.pages.contents import Contents
+from enact_dist.view.pages.datum import SMALL_BYTES, Lineage, Samples, file_of, recording_of
+from enact_dist.view.pages.panels import CellPanel, DatumPanel, Text, TimePanel, TreePanel
+from enact_dist.world.trees import shown_s
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from viser import ClientHandle
+
+    from enact_dist.core.protocol.datum import Slot
+    from enact_dist.view.catalogue import Listing
+    from enact_dist.view.drawing.scene import SceneView, Shown
+    from enact_dist.view.pages.viewer import Viewer
+
+LISTED_S: Final = 0.5
+"""How often tables are made anew."""
+RATE_WINDOW_S: Final = 3.0
+UP: Final = ".."
+_FROM: Final = np.array((1.1, -1.1, 0.9))
+"""From where a page looks, in sizes of the scene."""
+
+
+class Page:
+    """What one browser sees.
+
+    Args:
+        viewer: What all pages share.
+        client: The browser.
+    """
+
+    def __init__(self, viewer: Viewer, client: ClientHandle) -> None:
+        self._viewer, self._client = viewer, client
+        self._events: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
+        self._closed = False
+        self.contents = Contents(viewer.feed, viewer.source, viewer.compare)
+        self._canvas = Canvas(client)
+        self._lineage, self._samples = Lineage(), Samples()
+        self._path = self._filter = self._said = ""
+        self._datum: Slot | None = None
+        self._listing: Listing | None = None
+        self._drawable: list[Slot] = []
+        self._listed_s = self._ticked_s = 0.0
+        self._fitted = False
+        self._draws: deque[float] = deque()
+        self._remarks: tuple[str, ...] = ()
+        self._thread = threading.Thread(target=self._run, name="view page", daemon=True)
+
+    def start(self) -> None:
+        """Begin to show."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """End; returns at once."""
+        self._closed = True
+        self._events.put(("", None))
+
+    # ------------------------------------------------------------ the thread
+
+    def _send(self, name: str, value: Any) -> None:
+        self._events.put((name, value))
+
+    def _run(self) -> None:
+        try:
+            self._build()
+            while not self._closed:
+                begun_s = time.monotonic()
+                self._guarded(self._tick)
+                took_s = time.monotonic() - begun_s
+                # At most half of the time is spent here, however much there is to draw.
+                self._take_events(begun_s + max(1.0 / self._viewer.rate_hz, 2.0 * took_s))
+        finally:
+            self._viewer.feed.wish(self, None)
+            self._viewer.list_for(self, None)
+
+    def _take_events(self, until_s: float) -> None:
+        while not self._closed and (left_s := until_s - time.monotonic()) > 0.0:
+            try:
+                events = [self._events.get(timeout=left_s)]
+            except queue.Empty:
+                return
+            while not self._events.empty():
+                events.append(self._events.get())
+            newest = {name for name, _ in events if name == "seconds"}
+            for at, (name, value) in enumerate(events):
+                later = (other for other, _ in events[at + 1 :])
+                if name and not (name in newest and name in later):
+                    self._said, self._listed_s = "", 0.0
+                    self._guarded(getattr(self, f"_on_{name.replace(' ', '_')}"), value)
+            self._guarded(self._tick)
+
+    def _guarded(self, act: Any, *given: Any) -> None:
+        """Do something; what goes wrong is shown on the page."""
+        try:
+            act(*given)
+        except EnactError as error:
+            self._said = str(error)
+            self._show_status()
+
+    def _build(self) -> None:
+        gui = self._client.gui
+        self._status = Text(gui)
+        tabs = gui.add_tab_group()
+        is_cell = self._viewer.cell is not None
+        with tabs.add_tab("world"):
+            self._tree = TreePanel(self._client, self._send)
+        with tabs.add_tab("time"):
+            self._time = TimePanel(self._client, self._send, live=is_cell)
+        with tabs.add_tab("datum"):
+            self._detail = DatumPanel(self._client, self._send, cell=is_cell)
+        if is_cell:
+            with tabs.add_tab("cell"):
+                self._cell = CellPanel(self._client)
+        if not is_cell:
+            self.contents.player.look_back(self._viewer.timeline)
+        self.contents.world = self._viewer.world
+
+    def _tick(self) -> None:
+        now_s = time.monotonic()
+        contents, player = self.contents, self.contents.player
+        player.advance(min(1.0, now_s - self._ticked_s))
+        self._ticked_s = now_s
+        listing_due = now_s - self._listed_s >= LISTED_S
+        if listing_due:
+            self._listed_s = now_s
+            self._list()
+        drawn = contents.drawn(self._drawable)
+        labelled, rows = contents.labelled(), self._followed()
+        wanted = list(dict.fromkeys([*drawn, *labelled, *rows]))
+        self._viewer.feed.wish(self, wanted if player.live else ())
+        data = contents.data(wanted)
+        for slot in rows:
+            if player.live and slot in data:
+                self._samples.add(data[slot])
+        self._draw({slot: data[slot] for slot in (*drawn, *labelled) if slot in data})
+        if not player.live:
+            self._time.range(player.timeline.span_s, player.timeline.seconds(player.at_ns))
+        if listing_due:
+            self._show_panels(data)
+
+    def _draw(self, data: dict[Slot, Shown]) -> None:
+        scenes = self.contents.scenes(data)
+        if not self._fitted and scenes[""].nodes:
+            self._fit(scenes[""])
+        if self._canvas.draw(scenes):
+            self._draws.append(time.monotonic())
+        while self._draws and self._draws[0] < time.monotonic() - RATE_WINDOW_S:
+            self._draws.popleft()
+        self._remarks = tuple(one for scene in scenes.values() for one in scene.remarks)
+
+    def _fit(self, scene: SceneView) -> None:
+        """Look at all that is there, and choose the size of what has none."""
+        extent = extent_of(scene)
+        if extent is None:
+            return
+        low, high = extent
+        size_m = max(0.05, float(max(high - low)))
+        middle = (low + high) / 2.0
+        self._canvas.size_m = size_m
+        self._canvas.forget()
+        self._client.camera.look_at = tuple(middle)
+        self._client.camera.position = tuple(middle + size_m * _FROM)
+        self._fitted = True
+
+    # ------------------------------------------------------------ lists
+
+    def _list(self) -> None:
+        catalogue, contents = self._viewer.feed.catalogue, self.contents
+        worlds = catalogue.worlds()
+        if not contents.world and worlds:
+            contents.world = worlds[0]
+        self._listing = catalogue.listing(contents.world, self._path, self._filter)
+        self._drawable = contents.drawable()
+        self._samples.only(set(self._rows()))
+        self._viewer.list_for(self, self._rows())
+        self._tree.show_worlds(worlds, contents.world)
+
+    def _rows(self) -> list[Slot]:
+        rows = list(self._listing.slots) if self._listing is not None else []
+        return rows if self._datum is None or self._datum in rows else [*rows, self._datum]
+
+    def _followed(self) -> list[Slot]:
+        """Return the listed data whose values are shown: small ones, and the chosen datum."""
+        followed = []
+        for slot in self._rows():
+            entry = self._viewer.entry(slot)
+            if slot == self._datum or (entry is not None and entry.state.size <= SMALL_BYTES):
+                followed.append(slot)
+        return followed
+
+    def _show_panels(self, data: Mapping[Slot, Shown]) -> None:
+        contents, player, listing = self.contents, self.contents.player, self._listing
+        assert listing is not None
+        rows = [self._row(slot, data.get(slot)) for slot in listing.slots]
+        more = (
+            f"<div>… and {listing.left_out} more: use the filter</div>" if listing.left_out else ""
+        )
+        names = [markup.slot_name(slot) for slot in self._rows()]
+        ways = [(name, f"{name}/ ({count})") for name, count in listing.branches]
+        if self._path and not self._filter:
+            ways.insert(0, (UP, UP))
+        self._tree.show_place(markup.small(markup.text(f"{contents.world}:{self._path}")), ways)
+        chosen = markup.slot_name(self._datum) if self._datum is not None else ""
+        self._tree.show_rows(markup.small("".join(rows) + more), names, chosen)
+        aspects = sorted({slot.aspect for slot in self._drawable})
+        others = sorted({slot.aspect for slot in self._rows()} - set(aspects))
+        self._tree.show_layers(aspects, others, contents.label)
+        self._detail.show(self._datum_content(data))
+        options = [*(() if player.live else (NOW,)), *((MARKED,) if contents.marked_ns else ())]
+        others = [name for name in self._viewer.feed.catalogue.worlds() if name != contents.world]
+        if self._viewer.cell is not None:
+            self._time.compare(
+                [*options, *others], contents.comparing.against, contents.comparing.content
+            )
+            now = self._viewer.activity_now()
+            self._cell.show((now.locks, now.actors, now.shards))
+        self._time.show(markup.small(self._when()), live=player.live, playing=player.playing)
+        self._show_status()
+
+    def _row(self, slot: Slot, shown: Shown | None) -> str:
+        catalogue, now_s = self._viewer.feed.catalogue, time.monotonic()
+        entry, state = self._viewer.entry(slot), catalogue.state(slot)
+        name = slot.aspect if not self._filter else markup.slot_name(slot)
+        value = markup.text(markup.short_value(shown.value)) if shown is not None else ""
+        line = f"<b>{markup.text(name)}</b> {value} {markup.plot(self._samples.of(slot))}"
+        facts = [self._viewer.type_of(slot.aspect)]
+        if entry is not None:
+            facts.append(markup.size(entry.state.size))
+        rate_hz = catalogue.rate_hz(slot, now_s)
+        facts.append(f"{rate_hz:.3g} Hz" if rate_hz is not None else "")
+        if state is not None:
+            facts += [f"v{state.version}", markup.age(time.time_ns(), state.stamp_ns)]
+        if entry is not None and entry.cause is not None:
+            facts.append(f"by {entry.cause.actor or '(unnamed)'}")
+        held = self._viewer.activity_now().held.get(str(slot), "")
+        facts += [f"🔒 {held}"] if held else []
+        under = markup.text(" · ".join(filter(None, facts)))
+        return f'<div style="margin-bottom:3px">{line}<div style="color:#888">{under}</div></div>'
+
+    def _datum_content(self, data: Mapping[Slot, Shown]) -> str:
+        if self._datum is None:
+            return markup.small("choose a datum in the tab world")
+        head = f"<b>{markup.text(self._datum)}</b>"
+        shown = data.get(self._datum)
+        if shown is None:
+            known = self._datum in self.contents.forgotten
+            why = (
+                "has left its retention at this moment" if known else "is not there at this moment"
+            )
+            return markup.small(f"{head} {why}")
+        recorded = shown.recorded
+        parts = [f"v{recorded.version}", markup.clock(recorded.stamp_ns)]
+        if recorded.captured_ns:
+            parts.append(f"captured {markup.clock(recorded.captured_ns)}")
+        if recorded.null_reason:
+            parts.append(f"null: {recorded.null_reason}")
+        until_ns = 0 if self.contents.player.live else self.contents.player.at_ns
+        plot = markup.big_plot(self._samples.of(self._datum, until_ns))
+        facts = markup.text(" · ".join(parts))
+        return markup.small(f"{head}<div>{facts}</div>{markup.whole_value(shown.value)}") + plot
+
+    def _when(self) -> str:
+        contents, player = self.contents, self.contents.player
+        at = markup.clock(contents.at_ns) if contents.at_ns else "no commit yet"
+        if player.live:
+            return f"<b>now</b>, {at}"
+        line = player.timeline
+        parts = [f"<b>{at}</b>, {shown_s((line.newest_ns - player.at_ns) / 1e9)} before the newest"]
+        parts.append(f"history from {markup.clock(line.oldest_ns)}, {len(line.stamps_ns)} commits")
+        if line.whole_ns > line.oldest_ns:
+            parts.append(f"all data from {markup.clock(line.whole_ns)} on")
+        if contents.forgotten:
+            names = ", ".join(map(markup.slot_name, contents.forgotten[:4]))
+            more = ", …" if contents.forgotten[4:] else ""
+            parts.append(f"{len(contents.forgotten)} data have left their retention: {names}{more}")
+        return "<br>".join(markup.text(part) if "<b>" not in part else part for part in parts)
+
+    def _show_status(self) -> None:
+        feed, contents = self._viewer.feed, self.contents
+        rate_hz = len(self._draws) / RATE_WINDOW_S
+        parts = [f"{self._viewer.name} · {contents.world} · {rate_hz:.1f} updates/s"]
+        if feed.passed_over:
+            parts.append(f"{feed.passed_over} versions not shown: newer ones came first")
+        if feed.held_back:
+            parts.append(f"{feed.held_back} times data waited for the limit of bytes")
+        if contents.left_out:
+            parts.append(f"{contents.left_out} data not drawn: too many, switch layers off")
+        lines = [markup.text(part) for part in (*parts, *self._remarks[:5])]
+        wrong = [one for one in (feed.problem, self._said) if one]
+        lines += [f'<span style="color:#b00">{markup.text(one)}</span>' for one in wrong]
+        self._status.show(markup.small("<br>".join(lines)))
+
+    # ------------------------------------------------------------ events
+
+    def _on_world(self, name: str) -> None:
+        if name:
+            self.contents.world, self._path, self._datum = name, "", None
+
+    def _on_filter(self, wanted: str) -> None:
+        self._filter = wanted.strip()
+
+    def _on_branch(self, name: str) -> None:
+        if name == UP:
+            self._path = self._path.rstrip("/").rpartition("/")[0]
+            self._path += "/" if self._path else ""
+        else:
+            self._path += f"{name}/"
+
+    def _on_datum(self, name: str) -> None:
+        found = [slot for slot in self._rows() if markup.slot_name(slot) == name]
+        self._datum = found[0] if found else None
+        source = self._viewer.cell
+        if self._datum is not None and source is not None:
+            entry = self._viewer.entry(self._datum)
+            if entry is not None and entry.state.size <= SMALL_BYTES:
+                self._samples.learn(source, self._datum)
+
+    def _on_layer(self, box: tuple[str, bool]) -> None:
+        aspect, is_on = box
+        (self.contents.hidden.discard if is_on else self.contents.hidden.add)(aspect)
+
+    def _on_label(self, aspect: str) -> None:
+        self.contents.label = aspect
+
+    def _on_trails(self, wanted: bool) -> None:
+        self.contents.trails = wanted
+
+    def _on_fit(self, _: object) -> None:
+        self._fitted = False
+
+    def _on_live(self, wanted: bool) -> None:
+        if wanted:
+            self.contents.player.follow()
+        else:
+            self._look_back()
+
+    def _look_back(self, at_ns: int = 0) -> None:
+        slots = [*self.contents.drawn(self._drawable), *self._followed()]
+        self.contents.look_back(list(dict.fromkeys(slots)), at_ns)
+
+    def _past(self) -> None:
+        if self.contents.player.live:
+            self._look_back()
+
+    def _on_seconds(self, seconds: float) -> None:
+        self._past()
+        player = self.contents.player
+        player.at_ns, player.playing = player.timeline.at(seconds), False
+
+    def _on_step(self, by: int) -> None:
+        self._past()
+        player = self.contents.player
+        player.at_ns, player.playing = player.timeline.step(player.at_ns, by), False
+
+    def _on_play(self, wanted: bool) -> None:
+        self._past()
+        player = self.contents.player
+        if wanted and player.at_ns >= player.timeline.newest_ns:
+            player.at_ns = player.timeline.oldest_ns
+        player.playing = wanted
+
+    def _on_speed(self, speed: str) -> None:
+        self.contents.player.speed = float(speed)
+
+    def _on_mark(self, _: object) -> None:
+        self.contents.marked_ns = self.contents.at_ns
+
+    def _on_against(self, against: str) -> None:
+        self.contents.comparing.against = against
+
+    def _on_lineage(self, way: str) -> None:
+        shown, source = self._chosen(), self._viewer.cell
+        if shown is not None and source is not None:
+            self._lineage.ask(source, shown, way)
+            self._detail.show_tree(self._lineage.content, list(self._lineage.steps))
+
+    def _on_lineage_step(self, step: str) -> None:
+        if step in self._lineage.steps:
+            slot, at_ns = self._lineage.steps[step]
+            self.contents.world, self._datum, self._path = slot.context, slot, ""
+            self._list()
+            self._look_back(at_ns)
+
+    def _on_pin(self, label: str) -> None:
+        self._said = self._lineage.pin(label.strip(), self._viewer.pin)
+
+    def _on_download(self, kind: str) -> None:
+        if kind == "MCAP" and self._viewer.cell is not None:
+            at_ns = self.contents.at_ns
+            name, content = recording_of(
+                self._viewer.cell, self.contents.world, at_ns, self._viewer.shows
+            )
+        else:
+            shown = self._chosen()
+            if shown is None:
+                return
+            name, content = file_of(shown, kind)
+        self._client.send_file_download(name, content, save_immediately=True)
+
+    def _chosen(self) -> Shown | None:
+        """Return the chosen datum as of the moment; say on the page if there is none."""
+        shown = self.contents.data([self._datum]).get(self._datum) if self._datum else None
+        if shown is None:
+            self._said = "no datum is chosen, or it is not there at this moment"
+        return shown

@@ -1,0 +1,133 @@
+"""A recording as a source: its moments in order, one state of all slots at a time.
+
+Only the state of one moment is in memory.  To go back, the file is read again from its begin.
+"""
+
+from __future__ import annotations
+
+import threading
+from typing import TYPE_CHECKING
+
+from enact_dist.errors import ProtocolError
+from enact_dist.recording.reading import Recording
+from enact_dist.view.catalogue import Catalogue, ListedState
+from enact_dist.view.drawing.scene import IN_SCENE, Shown, shown_of
+from enact_dist.view.source import FoundData
+from enact_dist.view.timeline import Timeline
+
+if TYPE_CHECKING:
+    import os
+    from collections.abc import Callable, Iterable, Iterator, Sequence
+
+    from enact_dist.config.shows import Shows
+    from enact_dist.core.protocol.datum import Slot
+    from enact_dist.recording.exact import Recorded
+    from enact_dist.recording.reading import RecordedCommit
+    from enact_dist.view.source import Histories
+
+
+class RecordingSource:
+    """A recording.
+
+    Args:
+        path: The file; it is read through once.
+
+    Attributes:
+        name: Of the file.
+        timeline: All its moments.
+        catalogue: All its slots, as they are at its end.
+
+    Raises:
+        ConfigError: The file cannot be read, or is no recording of this project.
+        ProtocolError: It holds what this version cannot read.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self._recording = Recording(path)
+        self.name = self._recording.path.name
+        self.catalogue = Catalogue()
+        self._guard = threading.Lock()
+        self._state: dict[Slot, Recorded] = {}
+        self._commits: Iterator[RecordedCommit] = iter(())
+        self._ahead: RecordedCommit | None = None
+        self._at_ns = -1
+        stamps: set[int] = set()
+        for commit in self._recording.commits():
+            for one in commit.versions:
+                state = ListedState(one.version, one.stamp_ns, one.datum is None, one.captured_ns)
+                self.catalogue.note(one.slot, state, gap=0, now_s=one.stamp_ns / 1e9)
+                stamps.add(self._moment(commit))
+        ordered = tuple(sorted(stamps))
+        begin_ns = ordered[0] if ordered else 0
+        self.timeline = Timeline(ordered, begin_ns, begin_ns)
+        self.catalogue.newest_ns = self.timeline.newest_ns
+
+    def _moment(self, commit: RecordedCommit) -> int:
+        """Return when a commit was; of what was there before, when the recording began."""
+        begin_ns = int(self._recording.facts.get("begin_ns", "0") or 0)
+        newest_ns = max(one.stamp_ns for one in commit.versions)
+        return newest_ns if commit.number else max(newest_ns, begin_ns)
+
+    def data_at(self, slots: Sequence[Slot], at_ns: int) -> FoundData:
+        """Return data as of a moment.
+
+        Raises:
+            ProtocolError: The recording holds what this version cannot read.
+        """
+        with self._guard:
+            self._go_to(at_ns)
+            return FoundData({s: self._state[s] for s in slots if s in self._state}, ())
+
+    def _go_to(self, at_ns: int) -> None:
+        if at_ns < self._at_ns or self._at_ns < 0:
+            self._state, self._commits = {}, self._recording.commits()
+            self._ahead = next(self._commits, None)
+        while self._ahead is not None and self._moment(self._ahead) <= at_ns:
+            self._state |= {one.slot: one for one in self._ahead.versions}
+            self._ahead = next(self._commits, None)
+        self._at_ns = at_ns
+
+    def histories(self, slots: Sequence[Slot]) -> Histories:
+        """Return every moment of the recording as if each of these slots had it."""
+        return {slot: list(enumerate(self.timeline.stamps_ns, 1)) for slot in slots}
+
+
+class RecordingFeed:
+    """What pages ask of the present, of a recording, which has none.
+
+    Attributes:
+        catalogue: All slots.
+        problem: "".
+        passed_over: 0.
+        held_back: 0.
+        moment_ns: The end of the recording.
+    """
+
+    problem = ""
+    passed_over = held_back = 0
+
+    def __init__(self, source: RecordingSource, shows_of: Callable[[str], Shows]) -> None:
+        self.catalogue, self.shows_of = source.catalogue, shows_of
+        self.moment_ns = source.timeline.newest_ns
+        self._kinds: dict[str, frozenset[str]] = {}
+        unknown = [s for s in self.catalogue.first_of_aspects() if not shows_of(s.aspect).kinds]
+        for slot, recorded in source.data_at(unknown, self.moment_ns).data.items():
+            try:
+                drawables = shown_of(recorded, shows_of(slot.aspect)).drawables
+            except ProtocolError:
+                continue
+            self._kinds[slot.aspect] = frozenset(drawables)
+
+    def wish(self, page: object, slots: Iterable[Slot] | None) -> None:
+        """Do nothing: all data are in the file."""
+
+    def shown(self, slots: Iterable[Slot]) -> dict[Slot, Shown]:
+        """Return nothing: a recording has no present."""
+        return {}
+
+    def in_scene(self, slots: Iterable[Slot]) -> list[Slot]:
+        """Return the slots that the scene can show."""
+        return [slot for slot in slots if IN_SCENE & self._kinds_of(slot.aspect)]
+
+    def _kinds_of(self, aspect: str) -> frozenset[str]:
+        return frozenset(self.shows_of(aspect).kinds) or self._kinds.get(aspect, frozenset())
