@@ -104,7 +104,7 @@ class Activity:
     def _run(self) -> None:
         while True:
             with self._news:
-                self._news.wait_for(lambda: self._stopped or self._listed)
+                self._news.wait_for(lambda: self._stopped or bool(self._listed))
                 if self._stopped:
                     return
                 listed = self._listed.copy()
@@ -119,6 +119,10 @@ class Activity:
                 self._news.wait_for(
                     lambda known=listed: self._stopped or self._listed != known, pause_s
                 )
+
+    def _is_over(self, listed: Mapping[object, frozenset[Slot]]) -> bool:
+        """Whether a pause is over, because pages list something else."""
+        return self._stopped or self._listed != listed
 
     def _explain(self, slots: Iterable[Slot]) -> None:
         states = {slot: self._catalogue.state(slot) for slot in slots}

@@ -42,7 +42,8 @@ def text(value: object) -> str:
 
 def small(content: str) -> str:
     """Wrap markup in small type."""
-    return f'<div style="font-size:0.75em;line-height:1.35;overflow-x:auto">{content}</div>'
+    style = "font-size:0.75em;line-height:1.35;overflow-x:auto;padding:0 0.8em"
+    return f'<div style="{style}">{content}</div>'
 
 
 def table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, empty: str) -> str:

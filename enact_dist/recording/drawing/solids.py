@@ -20,6 +20,8 @@ _CORNERS: Final = {
 """Corners of the face of a unit cube by axis and side, counterclockwise as seen from outside."""
 VOXELS_MAX: Final = 1 << 20
 """Largest plausible extent of a voxel grid along one axis."""
+CELLS_MAX: Final = 1 << 26
+"""In a grid of more cells, hidden voxels are not looked for."""
 
 
 def voxel_faces(voxels: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -38,13 +40,9 @@ def voxel_faces(voxels: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int
     none = np.empty((0, 3), np.int64)
     if not len(voxels):
         return none, none
-    indices = np.asarray(voxels, np.int64)
-    lowest = indices.min(axis=0) - 1
-    extent = indices.max(axis=0) - lowest + 2  # a layer of nothing all around
-    if extent.max() > VOXELS_MAX:
-        raise ValueError(f"voxels lie {extent.max()} apart; a grid has at most {VOXELS_MAX}")
+    numbered, lowest, extent = _coded(voxels)
+    codes = np.unique(numbered)
     strides = np.array([extent[1] * extent[2], extent[2], 1])
-    codes = np.unique((indices - lowest) @ strides)
     faces = []
     for (axis, side), corners in _CORNERS.items():
         beyond = codes + (2 * side - 1) * strides[axis]
@@ -56,6 +54,39 @@ def voxel_faces(voxels: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int
     numbers = numbers.reshape(quads.shape)
     corners_at = np.stack(np.unravel_index(found, extent), axis=1) + lowest
     return corners_at, numbers[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
+
+
+def outer_voxels(voxels: NDArray[Any]) -> NDArray[np.int64]:
+    """Return the voxels (N, 3) that have a free side; those with six neighbours are left out.
+
+    Raises:
+        ValueError: The voxels lie more than `VOXELS_MAX` apart.
+    """
+    if not len(voxels):
+        return np.empty((0, 3), np.int64)
+    codes, lowest, extent = _coded(voxels)
+    if np.prod(extent, dtype=np.float64) > CELLS_MAX:
+        return np.stack(np.unravel_index(codes, extent), axis=1) + lowest
+    occupied = np.zeros(np.prod(extent), bool)
+    occupied[codes] = True
+    hidden = np.ones(len(codes), bool)
+    for step in (extent[1] * extent[2], extent[2], 1):
+        hidden &= occupied[codes - step] & occupied[codes + step]
+    return np.stack(np.unravel_index(codes[~hidden], extent), axis=1) + lowest
+
+
+def _coded(voxels: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Return voxels as numbers, the lowest corner and the extent of their grid.
+
+    A layer of nothing stands all around.
+    """
+    indices = np.asarray(voxels, np.int64)
+    lowest = indices.min(axis=0) - 1
+    extent = indices.max(axis=0) - lowest + 2
+    if extent.max() > VOXELS_MAX:
+        raise ValueError(f"voxels lie {extent.max()} apart; a grid has at most {VOXELS_MAX}")
+    strides = np.array([extent[1] * extent[2], extent[2], 1])
+    return (indices - lowest) @ strides, lowest, extent
 
 
 class Capsule(NamedTuple):

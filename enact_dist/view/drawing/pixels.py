@@ -23,14 +23,20 @@ def rgb_of(shown: ShownImage, side_px_max: int = SIDE_PX_MAX) -> NDArray[np.uint
         shown: The image; numbers that are no bytes go from black (smallest) to white (largest).
         side_px_max: Longest side; every n-th pixel of a larger image is taken.
     """
-    step = max(1, -(-max(shown.pixels.shape[:2]) // side_px_max))
-    pixels = shown.pixels[::step, ::step]
+    pixels = _every_nth(shown.pixels, side_px_max)
     if pixels.ndim == 3:
-        order = [2, 1, 0] if shown.encoding.startswith("bgr") else [0, 1, 2]
-        return np.ascontiguousarray(pixels[:, :, order])
+        pixels = pixels[:, :, :3]
+        return np.ascontiguousarray(
+            pixels[:, :, ::-1] if shown.encoding.startswith("bgr") else pixels
+        )
     if pixels.dtype != np.uint8:
         pixels = _as_bytes(pixels)
     return np.repeat(pixels[:, :, None], 3, axis=2)
+
+
+def _every_nth(pixels: NDArray[Any], side_px_max: int) -> NDArray[Any]:
+    step = max(1, -(-max(pixels.shape[:2]) // side_px_max))
+    return pixels[::step, ::step]
 
 
 def _as_bytes(pixels: NDArray[Any]) -> NDArray[np.uint8]:
@@ -47,7 +53,7 @@ def _as_bytes(pixels: NDArray[Any]) -> NDArray[np.uint8]:
 
 def with_mask(image: NDArray[np.uint8], mask: ShownImage) -> NDArray[np.uint8]:
     """Return an image with what a mask covers in red; a mask of another shape is left out."""
-    covers = rgb_of(mask, max(image.shape[:2]))[:, :, 0] > 0
+    covers = _every_nth(mask.pixels, max(image.shape[:2])) > 0
     if covers.shape != image.shape[:2]:
         return image
     found = image.copy()

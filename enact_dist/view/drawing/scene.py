@@ -19,6 +19,7 @@ from enact_dist.recording.drawing.drawables import (
     ShownVoxels,
     drawables_of,
 )
+from enact_dist.recording.drawing.solids import outer_voxels
 from enact_dist.view.drawing.frames import InParent, placed
 from enact_dist.view.drawing.pixels import rgb_of, with_mask
 from enact_dist.wire.payload import decode_untyped
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
 POINTS_MAX: Final = 100_000
 """Points of a larger cloud are thinned; the page says so."""
 TRIANGLES_MAX: Final = 300_000
-CUBES_MAX: Final = 20_000
+CUBES_MAX: Final = 1_000
 """More voxels than this are drawn as square points."""
 FRUSTUMS_MAX: Final = 4
 """Pictures that one image makes: with masks of different versions, in the colours of pages."""
@@ -246,9 +247,13 @@ def _node(frame: str, drawable: Drawable | None, tint: Colour | None) -> Node | 
             return None
         return SurfaceNode(frame, vertices, triangles, tint or MESH_COLOUR)
     if isinstance(drawable, ShownVoxels):
-        if not len(drawable.indices):
+        try:
+            indices = outer_voxels(drawable.indices)
+        except ValueError:
             return None
-        middles = drawable.origin_m + drawable.voxel_m * (drawable.indices + 0.5)
+        if not len(indices):
+            return None
+        middles = drawable.origin_m + drawable.voxel_m * (indices + 0.5)
         centres = middles.astype(np.float32)
         colour = tint or VOXEL_COLOUR
         if len(centres) > CUBES_MAX:
@@ -366,7 +371,12 @@ def extent_of(scene: SceneView) -> tuple[NDArray[np.float64], NDArray[np.float64
 def _places(node: Node) -> NDArray[np.float64]:
     """Return corners (N, 3) of what a node covers, in its frame."""
     if isinstance(node, CapsulesNode):
-        found = np.concatenate([capsule.ends_m for capsule in node.capsules])
+        corners = [
+            capsule.ends_m + sign * capsule.radius_m
+            for capsule in node.capsules
+            for sign in (-1.0, 1.0)
+        ]
+        found = np.concatenate(corners)
     elif isinstance(node, PointsNode):
         found = np.asarray(node.points_m, np.float64)
     elif isinstance(node, SurfaceNode):

@@ -55,7 +55,9 @@ SPHERE: Final = _rings([(0.5 * float(np.cos(t)), 0.5 * float(np.sin(t))) for t i
 CYLINDER: Final = _rings([(0.5, -0.5), (0.5, 0.5)])
 """Without its ends, which the spheres of a capsule cover."""
 CUBE: Final = ShapeMesh(
-    np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)], np.float32),
+    np.array(
+        [(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)], np.float32
+    ),
     np.array(
         [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1),
          (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)], np.uint32

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import singledispatchmethod
 from typing import TYPE_CHECKING, Any, Final
 
@@ -38,6 +39,8 @@ if TYPE_CHECKING:
     from enact_dist.view.drawing.shapes import Instances, ShapeMesh
 
 JPEG_QUALITY: Final = 75
+_FROM: Final = np.array((0.75, -0.75, 0.6))
+"""From where a page looks, in sizes of the scene."""
 TRAIL_COLOUR: Final = (120, 60, 160)
 
 
@@ -80,11 +83,25 @@ class Canvas:
                         sent += 1
         return sent
 
-    def forget(self) -> None:
-        """Draw everything anew the next time, as with another `size_m`."""
+    def fit(self, low_m: NDArray[np.float64], high_m: NDArray[np.float64]) -> None:
+        """Look at everything between two corners (3,); choose the sizes of axes, frusta, points."""
+        self.size_m = max(0.05, float(max(high_m - low_m)))
         for _, handle, _ in self._drawn.values():
             handle.remove()
         self._drawn.clear()
+        middle_m = (low_m + high_m) / 2.0
+        cell_m = 10.0 ** math.floor(math.log10(self.size_m / 2.0))
+        self._scene.add_grid(
+            "/grid",
+            width=2.0 * self.size_m,
+            height=2.0 * self.size_m,
+            cell_size=cell_m,
+            section_size=10.0 * cell_m,
+            position=(middle_m[0], middle_m[1], min(0.0, low_m[2])),
+        )
+        camera = self._client.camera
+        camera.position = tuple(middle_m + self.size_m * _FROM)
+        camera.look_at = tuple(middle_m)
 
     def _place(self, frame: str, pose: NDArray[np.float64]) -> None:
         known = self._frames.get(frame)
@@ -131,10 +148,14 @@ class Canvas:
         if isinstance(node, AxesNode) and isinstance(before, AxesNode):
             handle.wxyz, handle.position = _pose(node.matrix)
             return before.colour == node.colour
-        if isinstance(node, CapsulesNode) and isinstance(before, CapsulesNode):
-            if len(before.capsules) == len(node.capsules) and before.colour == node.colour:
-                handle.move(node)
-                return True
+        if (
+            isinstance(node, CapsulesNode)
+            and isinstance(before, CapsulesNode)
+            and len(before.capsules) == len(node.capsules)
+            and before.colour == node.colour
+        ):
+            handle.move(node)
+            return True
         return False
 
     @singledispatchmethod
@@ -147,7 +168,7 @@ class Canvas:
             path,
             node.field_rad,
             node.aspect,
-            scale=0.12 * self.size_m,
+            scale=0.06 * self.size_m,
             thickness=0.003 * self.size_m,
             color=node.colour,
             image=node.image,

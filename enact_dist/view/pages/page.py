@@ -8,8 +8,6 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-
 from enact_dist.errors import EnactError
 from enact_dist.view import markup
 from enact_dist.view.drawing.scene import extent_of
@@ -34,8 +32,8 @@ LISTED_S: Final = 0.5
 """How often tables are made anew."""
 RATE_WINDOW_S: Final = 3.0
 UP: Final = ".."
-_FROM: Final = np.array((1.1, -1.1, 0.9))
-"""From where a page looks, in sizes of the scene."""
+FITTED_S: Final = 2.0
+"""How long a new page waits for all data before it looks at those that have come."""
 
 
 class Page:
@@ -58,7 +56,8 @@ class Page:
         self._listing: Listing | None = None
         self._drawable: list[Slot] = []
         self._listed_s = self._ticked_s = 0.0
-        self._fitted = False
+        self._fits = 2
+        self._begun_s = time.monotonic()
         self._draws: deque[float] = deque()
         self._remarks: tuple[str, ...] = ()
         self._thread = threading.Thread(target=self._run, name="view page", daemon=True)
@@ -149,15 +148,17 @@ class Page:
         for slot in rows:
             if player.live and slot in data:
                 self._samples.add(data[slot])
-        self._draw({slot: data[slot] for slot in (*drawn, *labelled) if slot in data})
+        shown = {slot: data[slot] for slot in (*drawn, *labelled) if slot in data}
+        whole = len(shown) >= len(drawn) or now_s > self._begun_s + FITTED_S
+        self._draw(shown, fits=self._fits > (0 if whole else 1))
         if not player.live:
             self._time.range(player.timeline.span_s, player.timeline.seconds(player.at_ns))
         if listing_due:
             self._show_panels(data)
 
-    def _draw(self, data: dict[Slot, Shown]) -> None:
+    def _draw(self, data: dict[Slot, Shown], *, fits: bool) -> None:
         scenes = self.contents.scenes(data)
-        if not self._fitted and scenes[""].nodes:
+        if fits and scenes[""].nodes:
             self._fit(scenes[""])
         if self._canvas.draw(scenes):
             self._draws.append(time.monotonic())
@@ -170,14 +171,8 @@ class Page:
         extent = extent_of(scene)
         if extent is None:
             return
-        low, high = extent
-        size_m = max(0.05, float(max(high - low)))
-        middle = (low + high) / 2.0
-        self._canvas.size_m = size_m
-        self._canvas.forget()
-        self._client.camera.look_at = tuple(middle)
-        self._client.camera.position = tuple(middle + size_m * _FROM)
-        self._fitted = True
+        self._canvas.fit(*extent)
+        self._fits -= 1
 
     # ------------------------------------------------------------ lists
 
@@ -343,7 +338,7 @@ class Page:
         self.contents.trails = wanted
 
     def _on_fit(self, _: object) -> None:
-        self._fitted = False
+        self._fits = 1
 
     def _on_live(self, wanted: bool) -> None:
         if wanted:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import threading
+import warnings
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Final, Self
@@ -204,12 +205,13 @@ class ViewServer(Closing):
         require_viser()
         from enact_dist.view.pages.unshared import UnsharedServer
 
+        # A browser may go while its page draws: what is on its way then is no loss.
+        warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
         with contextlib.redirect_stdout(io.StringIO()):  # its own table of addresses
             self._server = UnsharedServer(host, port, label=viewer.name, verbose=False)
         self._server.gui.configure_theme(
             show_share_button=False, show_logo=False, control_width="large"
         )
-        self._server.scene.add_grid("/grid", width=10.0, height=10.0, cell_size=0.5)
         self._server.on_client_connect(viewer.open_page)
         self._server.on_client_disconnect(viewer.close_page)
         self.port = self._server.get_port()
