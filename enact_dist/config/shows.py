@@ -1,4 +1,6 @@
-"""How to show the data of an aspect, and in which frame: configured, or guessed by shape.
+"""How recordings and `enact view` show the data of an aspect, and in which frame.
+
+Configured, or guessed by shape.
 
 ::
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from collections import Counter
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -12,6 +13,7 @@ from enact_dist.patterns import pattern_matches
 if TYPE_CHECKING:
     from enact_dist.core.protocol.datum import Slot
 
+_NUMBERS: Final = re.compile(r"(\d+)")
 ROWS_MAX: Final = 30
 """Most data, and most branches, that are listed at once."""
 
@@ -44,6 +46,11 @@ class Listing(NamedTuple):
     branches: tuple[tuple[str, int], ...]
     slots: tuple[Slot, ...]
     left_out: int
+
+
+def _as_read(name: str) -> list[str | int]:
+    """Order names as people do: number 10 after number 9."""
+    return [int(part) if part.isdigit() else part for part in _NUMBERS.split(name)]
 
 
 class Catalogue:
@@ -129,6 +136,7 @@ class Catalogue:
                 branches[name] += 1
             else:
                 here.append(slot)
-        shown = list(branches.items())[:ROWS_MAX]
+        here.sort(key=lambda slot: (_as_read(slot.entity), slot.aspect))
+        shown = sorted(branches.items(), key=lambda each: _as_read(each[0]))[:ROWS_MAX]
         left_out = len(branches) - len(shown) + max(0, len(here) - ROWS_MAX)
         return Listing(tuple(shown), tuple(here[:ROWS_MAX]), left_out)

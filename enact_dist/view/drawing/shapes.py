@@ -65,6 +65,12 @@ CUBE: Final = ShapeMesh(
 )  # fmt: skip
 
 
+def linear(colour: tuple[int, int, int]) -> tuple[int, int, int]:
+    """Return an sRGB colour in linear numbers, as which viser 1.1 takes those of batched meshes."""
+    red, green, blue = (round(255.0 * (each / 255.0) ** 2.2) for each in colour)
+    return red, green, blue
+
+
 def unturned(places_m: NDArray[np.float32], size_m: float) -> Instances:
     """Return copies of one size at places (N, 3)."""
     turns = np.tile(np.array((1.0, 0.0, 0.0, 0.0), np.float32), (len(places_m), 1))

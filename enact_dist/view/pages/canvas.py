@@ -26,6 +26,7 @@ from enact_dist.view.drawing.shapes import (
     SPHERE,
     capsule_bodies,
     capsule_ends,
+    linear,
     unturned,
 )
 
@@ -216,7 +217,7 @@ class Canvas:
             turns,
             places,
             batched_scales=sizes,
-            batched_colors=colour,
+            batched_colors=linear(colour),
             flat_shading=mesh is CUBE,
             lod="off",
             cast_shadow=False,

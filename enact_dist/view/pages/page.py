@@ -232,7 +232,7 @@ class Page:
     def _row(self, slot: Slot, shown: Shown | None) -> str:
         catalogue, now_s = self._viewer.feed.catalogue, time.monotonic()
         entry, state = self._viewer.entry(slot), catalogue.state(slot)
-        name = slot.aspect if not self._filter else markup.slot_name(slot)
+        name = markup.slot_name(slot).removeprefix("" if self._filter else self._path)
         value = markup.text(markup.short_value(shown.value)) if shown is not None else ""
         line = f"<b>{markup.text(name)}</b> {value} {markup.plot(self._samples.of(slot))}"
         facts = [self._viewer.type_of(slot.aspect)]

@@ -212,6 +212,15 @@ class ViewServer(Closing):
         self._server.gui.configure_theme(
             show_share_button=False, show_logo=False, control_width="large"
         )
+        # viser's own light makes colours pale, and its shadows cost a browser without a graphics
+        # card most of its time.
+        scene = self._server.scene
+        scene.configure_default_lights(enabled=False)
+        scene.configure_environment_map(None)
+        scene.add_light_ambient("/light/around", intensity=2.2)
+        scene.add_light_directional(
+            "/light/above", intensity=1.5, position=(1.0, -2.0, 3.0), cast_shadow=False
+        )
         self._server.on_client_connect(viewer.open_page)
         self._server.on_client_disconnect(viewer.close_page)
         self.port = self._server.get_port()
