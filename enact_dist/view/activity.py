@@ -147,7 +147,12 @@ class Activity:
             lock_table(locks),
             actor_table(actors, time.time(), all_answer=len(reachable) == len(shards)),
             shard_table(shards) + counter_table(self._counters),
-            {slot: lock_mark(lock) for lock in locks if lock.granted for slot in lock.slots},
+            {
+                slot.partition(" (")[0]: lock_mark(lock)  # without how it is locked
+                for lock in locks
+                if lock.granted
+                for slot in lock.slots
+            },
         )
 
 

@@ -63,6 +63,7 @@ class Catalogue:
     def __init__(self) -> None:
         self._guard = threading.Lock()
         self._states: dict[Slot, ListedState] = {}
+        self._by_world: dict[str, list[Slot]] = {}
         self._first: dict[str, Slot] = {}
         self._rates = Rates()
         self.newest_ns = 0
@@ -75,6 +76,9 @@ class Catalogue:
             elif state.stamp_ns:
                 sample = Sample(state.stamp_ns, gap, 0, state.captured_ns)
                 self._rates.add(slot, sample, now_s)
+            before = self._states.get(slot)
+            if before is None or before.null != state.null:
+                self._by_world.pop(slot.context, None)
             if not state.null:
                 self._first.setdefault(slot.aspect, slot)
             elif self._first.get(slot.aspect) == slot:
@@ -97,10 +101,14 @@ class Catalogue:
             return list(self._first.values())
 
     def slots(self, world: str) -> list[Slot]:
-        """Return the data of a world context that are not null, by name."""
+        """Return the data of a world context that are not null, by name; not to be changed."""
         with self._guard:
-            states = self._states.copy()
-        return sorted(slot for slot, at in states.items() if slot.context == world and not at.null)
+            known = self._by_world.get(world)
+            if known is None:
+                there = [slot for slot, at in self._states.items() if not at.null]
+                known = sorted(slot for slot in there if slot.context == world)
+                self._by_world[world] = known
+            return known
 
     def worlds(self) -> list[str]:
         """Return the world contexts that have slots."""

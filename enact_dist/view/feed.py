@@ -31,6 +31,23 @@ PROBED_MAX: Final = 16
 """Aspects without `shows` whose first datum is looked at in one round."""
 
 
+def drawable(slots: Iterable[Slot], kinds: Callable[[str], frozenset[str] | None]) -> list[Slot]:
+    """Return the slots that a scene can show.
+
+    Args:
+        slots: Some slots.
+        kinds: As what the data of an aspect are shown; None: not known yet.
+    """
+    shown: dict[str, bool] = {}
+    found = []
+    for slot in slots:
+        if slot.aspect not in shown:
+            shown[slot.aspect] = bool(IN_SCENE & (kinds(slot.aspect) or frozenset()))
+        if shown[slot.aspect]:
+            found.append(slot)
+    return found
+
+
 class Feed:
     """The thread that follows a cell.
 
@@ -112,7 +129,7 @@ class Feed:
 
     def in_scene(self, slots: Iterable[Slot]) -> list[Slot]:
         """Return the slots that the scene can show."""
-        return [slot for slot in slots if IN_SCENE & (self.kinds(slot.aspect) or frozenset())]
+        return drawable(slots, self.kinds)
 
     # ------------------------------------------------------------ the thread
 

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 from enact_dist.errors import ProtocolError
 from enact_dist.recording.reading import Recording
 from enact_dist.view.catalogue import Catalogue, ListedState
-from enact_dist.view.drawing.scene import IN_SCENE, Shown, shown_of
+from enact_dist.view.drawing.scene import Shown, shown_of
+from enact_dist.view.feed import drawable
 from enact_dist.view.source import FoundData
 from enact_dist.view.timeline import Timeline
 
@@ -127,7 +128,7 @@ class RecordingFeed:
 
     def in_scene(self, slots: Iterable[Slot]) -> list[Slot]:
         """Return the slots that the scene can show."""
-        return [slot for slot in slots if IN_SCENE & self._kinds_of(slot.aspect)]
+        return drawable(slots, self._kinds_of)
 
     def _kinds_of(self, aspect: str) -> frozenset[str]:
         return frozenset(self.shows_of(aspect).kinds) or self._kinds.get(aspect, frozenset())

@@ -71,8 +71,10 @@ class Timeline:
 
     def including(self, stamps_ns: Iterable[int]) -> Timeline:
         """Return one that also reaches to these moments."""
-        stamps = tuple(sorted({*self.stamps_ns, *stamps_ns}))
-        return Timeline(stamps, min(self.oldest_ns or stamps[0], stamps[0]), self.whole_ns)
+        more = set(stamps_ns)
+        stamps = tuple(sorted({*self.stamps_ns, *more}))
+        left = more | ({self.oldest_ns} if self.oldest_ns else set())
+        return Timeline(stamps, min(left, default=0), self.whole_ns)
 
 
 @dataclass(slots=True)

@@ -1,6 +1,6 @@
-"""A cell of one shard as processes, for the pages of `enact view`."""
+"""The samples beside these tests."""
 
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "e2e"))
+sys.path.insert(0, str(Path(__file__).parent))

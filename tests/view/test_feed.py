@@ -1,0 +1,226 @@
+"""The present and the past of a cell as pages get them, without a browser."""
+
+import threading
+
+import numpy as np
+import pytest
+
+from enact_dist import Aspect, Entity, Lock, Retention, Write, local
+from enact_dist.config.shows import GUESSED, Shows
+from enact_dist.core.protocol.datum import Slot
+from enact_dist.recording import Recorder
+from enact_dist.view.activity import Activity
+from enact_dist.view.feed import Feed
+from enact_dist.view.pages.comparing import MARKED, NOW, Side
+from enact_dist.view.pages.contents import Contents
+from enact_dist.view.pages.datum import Lineage, Samples
+from enact_dist.view.pages.viewer import Viewer, ViewSettings
+from enact_dist.view.recorded import RecordingFeed, RecordingSource
+from enact_dist.view.source import CellSource
+
+POSE = Aspect("pose", np.ndarray, retention=Retention(versions=3))
+SPEED = Aspect("speed", float)
+ARM = Entity("arm")
+SLOT, SPEED_SLOT = Slot("online", "arm", "pose"), Slot("online", "arm", "speed")
+SHOWS = {"pose": Shows(("pose",), frame="cell")}
+
+
+def moved(x_m):
+    matrix = np.eye(4)
+    matrix[0, 3] = x_m
+    return matrix
+
+
+def until(is_right):
+    """Wait until something holds that other threads bring about."""
+    pause = threading.Event()
+    for _ in range(2000):
+        if is_right():
+            return
+        pause.wait(0.01)
+    raise AssertionError("nothing came of it within 20 s")
+
+
+@pytest.fixture
+def cell():
+    with local(worlds=["online", "truth"], actor="writer") as cell:
+        online = cell.world("online")
+        online.init(ARM, SPEED, 0.5)
+        online.init(ARM, POSE, moved(0.0))
+        yield cell
+
+
+def move(cell, x_m, world="online"):
+    pose = Write(cell.world(world), ARM, POSE)
+    with Lock(pose) as lock:
+        lock[pose] = moved(x_m)
+    return lock.position
+
+
+@pytest.fixture
+def feed(cell):
+    found = Feed(
+        CellSource(cell), lambda aspect: SHOWS.get(aspect, GUESSED), rate_hz=50.0, bytes_s=1e9
+    )
+    found.start()
+    yield found
+    found.stop()
+
+
+def contents_of(cell, feed):
+    viewer = Viewer.compare
+    return Contents(feed, CellSource(cell), lambda *sides: viewer(Shim(cell), *sides))
+
+
+class Shim:
+    """What `Viewer.compare` needs of a viewer."""
+
+    def __init__(self, cell):
+        self.cell = CellSource(cell)
+        self._settings = ViewSettings()
+
+
+def test_the_feed_follows_what_pages_show(cell, feed):
+    """Only wanted data are fetched; an aspect without `shows` is looked at once."""
+    feed.wish("page", [SLOT])
+    until(lambda: SLOT in feed.shown([SLOT]) and feed.kinds("speed"))
+    assert feed.kinds("speed") == {"json"}
+    assert feed.in_scene([SLOT, SPEED_SLOT]) == [SLOT]
+    until(lambda: feed.shown([SPEED_SLOT]) == {})
+    move(cell, 2.0)
+    until(lambda: feed.shown([SLOT])[SLOT].value[0, 3] == 2.0)
+    feed.wish("page", None)
+    assert feed.problem == ""
+
+
+def test_passed_over_versions_and_bytes_are_counted(cell):
+    """A limit of bytes lets data wait, and only the newest comes."""
+    slow = Feed(CellSource(cell), lambda _: SHOWS["pose"], rate_hz=50.0, bytes_s=300.0)
+    slow.start()
+    try:
+        slow.wish("page", [SLOT])
+        until(lambda: SLOT in slow.shown([SLOT]))
+        for x_m in range(1, 9):
+            move(cell, float(x_m))
+        until(lambda: slow.shown([SLOT])[SLOT].value[0, 3] == 8.0)
+        assert slow.passed_over + slow.held_back > 0
+    finally:
+        slow.stop()
+
+
+def test_the_past_is_exact_and_forgotten_data_are_named(cell, feed):
+    positions = [move(cell, x_m) for x_m in (1.0, 2.0, 3.0, 4.0)]
+    feed.wish("page", [SLOT])
+    until(lambda: feed.catalogue.slots("online") == [SLOT, SPEED_SLOT])
+    contents = contents_of(cell, feed)
+    contents.world = "online"
+    contents.look_back([SLOT, SPEED_SLOT])
+    timeline = contents.player.timeline
+    assert len(timeline.stamps_ns) >= 3
+    contents.player.at_ns = positions[2].stamp_ns
+    data = contents.data([SLOT, SPEED_SLOT])
+    assert data[SLOT].value[0, 3] == 3.0
+    assert contents.data([SLOT, SPEED_SLOT])[SLOT] is data[SLOT]
+    contents.player.at_ns = positions[2].stamp_ns + 1
+    assert contents.data([SLOT, SPEED_SLOT])[SLOT] is data[SLOT]
+
+
+def test_a_difference_is_coloured_and_labelled(cell, feed):
+    """Against a marked moment, and against another world context."""
+    feed.wish("page", [SLOT])
+    until(lambda: feed.shown([SLOT]))
+    contents = contents_of(cell, feed)
+    contents.world = "online"
+    before = move(cell, 1.0)
+    after = move(cell, 2.0)
+    contents.player.look_back(contents.player.timeline.including([after.stamp_ns]), after.stamp_ns)
+    contents.marked_ns = before.stamp_ns
+    contents.comparing.against = MARKED
+    scenes = contents.scenes(contents.data([SLOT]))
+    (mine,) = (node for name, node in scenes[""].nodes.items() if "#pose" in name)
+    assert mine.colour == (255, 150, 0)
+    assert "label arm" in scenes[""].nodes
+    (other,) = scenes["right "].nodes.values()
+    assert other.matrix[0, 3] == 1.0
+    assert "1 differ" in contents.comparing.content
+
+    contents.comparing.against = "truth"
+    scenes = contents.scenes(contents.data([SLOT]))
+    assert "only left" in contents.comparing.content
+    assert list(scenes) == [""]
+    contents.comparing.against = ""
+    assert contents.scenes(contents.data([SLOT]))[""].nodes.keys() == {"online:arm/pose#pose"}
+    assert contents.comparing.right_tints() == {}
+
+
+def test_now_is_a_difference_that_is_made_again(cell, feed):
+    feed.wish("page", [SLOT])
+    until(lambda: feed.shown([SLOT]))
+    contents = contents_of(cell, feed)
+    contents.world, contents.comparing.against = "online", NOW
+    contents.comparing.look(
+        Side("online", feed.moment_ns), live=True, now_ns=feed.moment_ns, marked_ns=0
+    )
+    assert "0 differ" in contents.comparing.content
+
+
+def test_causes_are_steps_and_a_label_keeps_them(cell, feed):
+    move(cell, 1.0)
+    feed.wish("page", [SLOT])
+    until(lambda: feed.shown([SLOT]))
+    lineage, pinned = Lineage(), []
+    lineage.ask(CellSource(cell), feed.shown([SLOT])[SLOT], "why")
+    assert next(iter(lineage.steps)).startswith("1. online:arm/pose v2")
+    said = lineage.pin("incident-7", lambda *given: pinned.append(given))
+    assert (pinned[0][0], said.split()[0]) == ("incident-7", str(len(pinned[0][1])))
+
+
+def test_numbers_have_the_history_of_their_datum(cell):
+    speed = Write(cell.world("online"), ARM, SPEED)
+    for value in (1.0, 2.0):
+        with Lock(speed) as lock:
+            lock[speed] = value
+    samples = Samples()
+    samples.learn(CellSource(cell), SPEED_SLOT)
+    assert [numbers[""] for _, numbers in samples.of(SPEED_SLOT)] == [0.5, 1.0, 2.0]
+    samples.only(set())
+    assert samples.of(SPEED_SLOT) == []
+
+
+def test_locks_actors_and_shards_are_tables(cell, feed):
+    feed.wish("page", [SLOT])
+    until(lambda: feed.catalogue.slots("online"))
+    activity = Activity(CellSource(cell), feed.catalogue)
+    activity.start()
+    try:
+        with Lock(Write(cell.world("online"), ARM, POSE)):
+            activity.list("page", [SLOT])
+            until(lambda: activity.now.held)
+        assert "held by writer" in activity.now.held["online:arm/pose"]
+        assert "online:arm/pose" in activity.now.locks
+        assert "open" in activity.now.shards
+        until(lambda: activity.entry(SLOT))
+        assert activity.entry(SLOT).cause.actor == "writer"
+        assert activity.type_of("pose")
+    finally:
+        activity.stop()
+
+
+def test_a_recording_is_a_past(cell, tmp_path):
+    """Forwards and backwards, with nothing but one state in memory."""
+    recorder, stop = Recorder(cell, tmp_path / "run.mcap"), threading.Event()
+    done = threading.Thread(target=recorder.run, args=(stop,))
+    done.start()
+    until(lambda: (tmp_path / "run.mcap").exists() and (tmp_path / "run.mcap").stat().st_size)
+    positions = [move(cell, x_m) for x_m in (1.0, 2.0, 3.0)]
+    cell.wait(positions[-1])
+    until(lambda: recorder.summary.versions >= 5)
+    stop.set()
+    done.join()
+    source = RecordingSource(tmp_path / "run.mcap")
+    feed = RecordingFeed(source, lambda aspect: SHOWS.get(aspect, GUESSED))
+    assert feed.in_scene(source.catalogue.slots("online")) == [SLOT]
+    for position, x_m in ((positions[2], 3.0), (positions[0], 1.0), (positions[1], 2.0)):
+        contents = Contents(feed, source, lambda *_: None)
+        contents.player.look_back(source.timeline, position.stamp_ns)
+        assert contents.data([SLOT])[SLOT].value[0, 3] == x_m

@@ -1,0 +1,163 @@
+"""What pages list: moments, slots, numbers, and texts that cannot become markup."""
+
+import math
+
+import numpy as np
+import pytest
+from view_samples import BEGIN_NS, SECOND_NS, slot
+
+from enact_dist.view import markup
+from enact_dist.view.catalogue import ROWS_MAX, Catalogue, ListedState
+from enact_dist.view.timeline import Player, Timeline
+
+
+def at(*seconds):
+    return [BEGIN_NS + round(each * SECOND_NS) for each in seconds]
+
+
+# ---------------------------------------------------------------- moments
+
+MOVING, STILL = slot("robot", "pose"), slot("camera", "calibration")
+LINE = Timeline.of(
+    {
+        MOVING: list(zip((7, 8, 9), at(10, 11, 13), strict=True)),
+        slot("hull"): list(zip((1, 2), at(9, 12), strict=True)),
+        STILL: [(1, at(-3600)[0])],
+    }
+)
+
+
+def test_a_timeline_begins_with_the_first_datum_that_changed():
+    """A calibration of an hour ago does not stretch the slider."""
+    assert (LINE.oldest_ns, LINE.newest_ns, LINE.span_s) == (*at(9, 13), 4.0)
+    assert LINE.whole_ns == at(10)[0]  # before that, the pose has left its retention
+
+
+def test_steps_go_from_commit_to_commit():
+    assert LINE.step(at(13)[0], -1) == at(12)[0]
+    assert LINE.step(at(11.5)[0], -1) == at(11)[0]
+    assert LINE.step(at(11.5)[0], 1) == at(12)[0]
+    assert LINE.step(at(13)[0], 1) == at(13)[0]
+    assert LINE.step(at(9)[0], -1) == at(9)[0]
+
+
+def test_a_moment_is_seconds_after_the_left_end():
+    assert LINE.at(1.5) == at(10.5)[0]
+    assert LINE.at(99.0) == at(13)[0]
+    assert LINE.seconds(at(10.5)[0]) == 1.5
+    assert Timeline().at(1.0) == 0
+
+
+def test_a_cause_before_the_left_end_can_be_shown():
+    longer = LINE.including(at(2))
+    assert (longer.oldest_ns, longer.step(at(2)[0], -1)) == (at(2)[0], at(2)[0])
+
+
+def test_playing_goes_on_at_its_speed_and_stops_at_the_end():
+    player = Player()
+    player.look_back(LINE, at(10)[0])
+    player.playing, player.speed = True, 0.5
+    player.advance(2.0)
+    assert (player.at_ns, player.playing) == (at(11)[0], True)
+    player.advance(60.0)
+    assert (player.at_ns, player.playing) == (at(13)[0], False)
+    player.follow()
+    assert player.live
+
+
+# ---------------------------------------------------------------- slots
+
+
+def filled(*slots):
+    catalogue = Catalogue()
+    for number, each in enumerate(slots, 1):
+        state = ListedState(1, BEGIN_NS + number, null=False)
+        catalogue.note(each, state, gap=0, now_s=0.0)
+    return catalogue
+
+
+def test_the_tree_has_branches_and_data():
+    catalogue = filled(slot("camera/10/left"), slot("camera/2"), slot("camera/10"), slot("hull"))
+    root = catalogue.listing("online")
+    assert (root.branches, root.slots) == ((("camera", 3),), (slot("hull"),))
+    below = catalogue.listing("online", "camera/")
+    assert below.branches == (("10", 1),)
+    assert below.slots == (slot("camera/2"), slot("camera/10"))
+    assert catalogue.listing("truth") == ((), (), 0)
+
+
+@pytest.mark.parametrize("wanted", ["HULL", "all/*/x", "x/size"])
+def test_a_filter_takes_a_part_of_a_name_or_a_pattern(wanted):
+    catalogue = filled(slot("all/1/x", "hull"), slot("all/2/y", "other"), slot("all/1/x", "size"))
+    found = catalogue.listing("online", "camera/", wanted).slots
+    assert found
+    assert slot("all/2/y", "other") not in found
+
+
+def test_long_lists_are_cut_and_counted():
+    catalogue = filled(*(slot(f"part/{number}") for number in range(100)))
+    listing = catalogue.listing("online", "part/")
+    assert (len(listing.slots), listing.left_out) == (ROWS_MAX, 100 - ROWS_MAX)
+    assert listing.slots[9] == slot("part/9")
+
+
+def test_null_slots_are_not_listed_until_they_are_set_again():
+    catalogue = filled(slot("a"))
+    catalogue.note(slot("a"), ListedState(2, BEGIN_NS + 5, null=True), gap=0, now_s=1.0)
+    assert catalogue.slots("online") == []
+    assert catalogue.first_of_aspects() == []
+    catalogue.note(slot("a"), ListedState(3, BEGIN_NS + 6, null=False), gap=0, now_s=1.0)
+    assert catalogue.slots("online") == catalogue.first_of_aspects() == [slot("a")]
+
+
+def test_a_rate_is_that_of_the_commits():
+    catalogue = filled(slot("a"))
+    assert catalogue.rate_hz(slot("a"), 0.0) is None
+    for number in range(1, 12):
+        state = ListedState(number + 1, BEGIN_NS + number * SECOND_NS // 10, null=False)
+        catalogue.note(slot("a"), state, gap=0, now_s=number / 10)
+    assert catalogue.rate_hz(slot("a"), 1.1) == pytest.approx(10.0)
+
+
+# ---------------------------------------------------------------- markup
+
+
+def test_texts_of_the_cell_are_no_markup():
+    """Neither a value nor an actor's error runs in the browser of an operator."""
+    evil = "<img src=x onerror=alert(1)>"
+    for content in (
+        markup.table(("a",), [(evil,)], empty=""),
+        markup.table(("a",), [], empty=evil),
+        markup.whole_value({evil: evil}),
+        markup.big_plot([(1, {evil: 1.0}), (2, {evil: 2.0})]),
+    ):
+        assert "<img" not in content
+
+
+@pytest.mark.parametrize(
+    ("value", "numbers"),
+    [
+        (1.5, {"": 1.5}),
+        (True, {"": 1.0}),
+        ("text", {}),
+        ({"x": 1, "note": "a", "in": {"y": [2, 3]}}, {"x": 1.0, "in.y[0]": 2.0, "in.y[1]": 3.0}),
+        (np.array([1.0, 2.0]), {"[0]": 1.0, "[1]": 2.0}),
+        (np.zeros((100, 3)), {}),
+    ],
+)
+def test_numbers_of_a_datum_by_their_place(value, numbers):
+    assert markup.numbers_in(value) == numbers
+
+
+def test_a_plot_has_a_line_for_each_number_within_its_picture():
+    samples = [(BEGIN_NS + i, {"a": float(i), "b": math.inf if i == 1 else -1.0}) for i in range(3)]
+    picture = markup.plot(samples, wide_px=100, high_px=20)
+    assert picture.count("<polyline") == 2
+    assert 'points="0.0,13.0 50.0,7.0 100.0,1.0"' in picture
+    assert markup.plot(samples[:1]) == ""
+
+
+def test_a_long_value_is_one_short_line():
+    text = markup.short_value({"x": list(range(100))})
+    assert len(text) == markup.VALUE_SHOWN_MAX + 1
+    assert markup.short_value(np.zeros((480, 640))).startswith("array 480 x 640")

@@ -1,0 +1,284 @@
+"""From data to nodes: what is drawn, where, in which colour, and what is left out."""
+
+import struct
+from dataclasses import dataclass
+from io import BytesIO
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as nps
+from view_samples import shown, slot
+
+from enact_dist.errors import ConfigError
+from enact_dist.recording.drawing.solids import outer_voxels, voxel_faces
+from enact_dist.view.drawing import scene as scenes
+from enact_dist.view.drawing.files import ply_of, png_of
+from enact_dist.view.drawing.frames import InParent, placed
+from enact_dist.view.drawing.scene import (
+    AxesNode,
+    CapsulesNode,
+    CubesNode,
+    FrustumNode,
+    PointsNode,
+    SurfaceNode,
+    extent_of,
+    labels_of,
+    scene_of,
+)
+from enact_dist.view.drawing.shapes import capsule_bodies, capsule_ends, linear
+from enact_dist.view.drawing.trails import Trails
+
+
+def moved(x_m=0.0, y_m=0.0, z_m=0.0):
+    matrix = np.eye(4)
+    matrix[:3, 3] = x_m, y_m, z_m
+    return matrix
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    points_m: np.ndarray
+    colours: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    vertices_m: np.ndarray
+    triangles: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Occupied:
+    voxels: np.ndarray
+    voxel_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    camera_matrix: np.ndarray
+    width: int
+    height: int
+    camera_from_cell: np.ndarray
+
+
+def one_node(data):
+    """Return the only node of a scene of one datum."""
+    (node,) = scene_of({data.recorded.slot: data}).nodes.values()
+    return node
+
+
+# ---------------------------------------------------------------- frames
+
+
+def test_frames_stand_where_their_chain_of_transforms_leads():
+    chain = {"hand": InParent("arm", moved(1.0)), "arm": InParent("cell", moved(0.0, 2.0))}
+    found = placed(chain, ["hand"])
+    assert found.poses["hand"][:3, 3].tolist() == [1.0, 2.0, 0.0]
+    assert found.roots == ("cell",)
+
+
+def test_frames_without_a_common_root_and_circles_are_named():
+    """Nothing says where they are, so all stand at the origin."""
+    circle = {"a": InParent("b", moved(1.0)), "b": InParent("a", moved(1.0))}
+    found = placed(circle, ["a", "alone", "other"])
+    assert found.roots == ("alone", "other")
+    assert set(found.circular) == {"a", "b"}
+    assert found.poses["a"].tolist() == np.eye(4).tolist()
+
+
+def test_a_transform_moves_what_stands_in_its_frame():
+    place = shown(moved(5.0), "transform", entity="tray", parent="cell")
+    cloud = shown(Cloud(np.zeros((2, 3))), entity="pack", frame="tray")
+    scene = scene_of({one.recorded.slot: one for one in (place, cloud)})
+    low_m, high_m = extent_of(scene)
+    assert (low_m.tolist(), high_m.tolist()) == ([5.0, 0.0, 0.0], [5.0, 0.0, 0.0])
+    assert scene.remarks == ()
+
+
+# ---------------------------------------------------------------- kinds
+
+
+def test_a_cloud_keeps_its_colours_and_loses_what_is_not_finite():
+    points = np.array([[0, 0, 0], [np.nan, 0, 0], [1, 1, 1]], np.float32)
+    colours = np.array([[1, 2, 3], [4, 5, 6], [7, 8, 9]], np.uint8)
+    node = one_node(shown(Cloud(points, colours)))
+    assert isinstance(node, PointsNode)
+    assert node.colours.tolist() == [[1, 2, 3], [7, 8, 9]]
+
+
+def test_an_empty_cloud_is_no_node():
+    """A browser stops at a cloud without points."""
+    empty = shown(Cloud(np.empty((0, 3))))
+    assert scene_of({empty.recorded.slot: empty}).nodes == {}
+
+
+def test_a_large_cloud_is_thinned_and_the_page_says_so():
+    cloud = shown(Cloud(np.zeros((scenes.POINTS_MAX * 2 + 1, 3), np.float32)))
+    scene = scene_of({cloud.recorded.slot: cloud})
+    (node,) = scene.nodes.values()
+    assert len(node.points_m) <= scenes.POINTS_MAX
+    assert "one in 3 is shown" in scene.remarks[0]
+
+
+def test_a_mesh_loses_triangles_of_vertices_that_it_has_not():
+    mesh = shown(Mesh(np.eye(3), np.array([[0, 1, 2], [0, 1, 3]])))
+    node = one_node(mesh)
+    assert isinstance(node, SurfaceNode)
+    assert node.triangles.tolist() == [[0, 1, 2]]
+
+
+def test_voxels_are_cubes_around_their_middles():
+    node = one_node(shown(Occupied(np.array([[1, 0, 0]]), 0.5)))
+    assert isinstance(node, CubesNode)
+    assert node.centres_m.tolist() == [[0.75, 0.25, 0.25]]
+
+
+def test_many_voxels_are_square_points():
+    grid = np.stack(np.meshgrid(*[np.arange(16)] * 3), axis=-1).reshape(-1, 3)
+    node = one_node(shown(Occupied(grid, 0.5)))
+    assert isinstance(node, PointsNode)
+    assert node.size_m == 0.5
+    assert len(node.points_m) == 16**3 - 14**3
+
+
+@given(nps.arrays(np.int16, st.tuples(st.integers(0, 60), st.just(3)), elements=st.integers(0, 4)))
+def test_voxels_that_are_left_out_have_no_face(voxels):
+    """All faces of a set of voxels are faces of its outer ones."""
+    outer = outer_voxels(voxels)
+    there = {tuple(each) for each in voxels.tolist()}
+    steps = [moved_by for axis in np.eye(3, dtype=int) for moved_by in (axis, -axis)]
+    expected = {
+        each for each in there if any(tuple(np.add(each, step)) not in there for step in steps)
+    }
+    assert {tuple(each) for each in outer.tolist()} == expected
+    assert len(voxel_faces(voxels)[1]) >= len(expected)
+
+
+def test_capsules_are_spheres_and_cylinders():
+    rows = np.array([[0, 0, 0, 0, 0, 2.0, 0.25]])
+    node = one_node(shown(rows, "capsules"))
+    assert isinstance(node, CapsulesNode)
+    ends, bodies = capsule_ends(node.capsules), capsule_bodies(node.capsules)
+    assert ends.places_m.tolist() == [[0, 0, 0], [0, 0, 2]]
+    assert ends.sizes_m.tolist() == [[0.5] * 3] * 2
+    assert (bodies.places_m.tolist(), bodies.sizes_m.tolist()) == ([[0, 0, 1]], [[0.5, 0.5, 2.0]])
+
+
+def test_a_datum_that_does_not_fit_its_kind_is_left_out():
+    wrong = shown(np.zeros(4), "capsules", "pose")
+    assert scene_of({wrong.recorded.slot: wrong}).nodes == {}
+
+
+def test_a_colour_of_a_difference_replaces_that_of_the_datum():
+    cloud = shown(Cloud(np.zeros((1, 3)), np.zeros((1, 3), np.uint8)))
+    scene = scene_of({cloud.recorded.slot: cloud}, tints={cloud.recorded.slot: (255, 150, 0)})
+    (node,) = scene.nodes.values()
+    assert node.colours == (255, 150, 0)
+    assert linear((0, 255, 128)) == (0, 255, 56)
+
+
+# ---------------------------------------------------------------- cameras
+
+
+def lens(entity="camera/1"):
+    matrix = np.array([[100.0, 0, 4], [0, 100.0, 3], [0, 0, 1]])
+    return shown(
+        Lens(matrix, 8, 6, moved(0.0, 0.0, -2.0)), "calibration", "transform",
+        entity=entity, aspect="calibration", parent="cell", inverse=True,
+    )  # fmt: skip
+
+
+def test_an_image_stands_at_its_camera_with_its_mask_in_red():
+    """The frustum has the opening of the calibration; the camera is where its transform says."""
+    image = shown(
+        np.full((6, 8, 3), (0, 0, 200), np.uint8), "image", entity="camera/1", encoding="bgr8"
+    )
+    mask = shown(np.eye(6, 8) > 0, "mask", entity="camera/1", aspect="mask")
+    scene = scene_of({one.recorded.slot: one for one in (image, mask, lens())})
+    (node,) = scene.nodes.values()
+    assert isinstance(node, FrustumNode)
+    assert node.field_rad == pytest.approx(2 * np.arctan(0.03))
+    assert node.aspect == 8 / 6
+    assert node.image[0, 1].tolist() == [200, 0, 0]  # blue, green, red is how it came
+    assert node.image[0, 0].tolist() == [227, 25, 15]
+    assert scene.frames["camera/1"][:3, 3].tolist() == [0.0, 0.0, 2.0]
+
+
+def test_a_node_is_made_once_for_each_version():
+    """Pages send a node only if it is another object."""
+    image = shown(np.zeros((6, 8, 3), np.uint8), "image", entity="camera/1")
+    newer = shown(np.zeros((6, 8, 3), np.uint8), "image", entity="camera/1", version=2)
+    camera = lens()
+    first, again, other = (
+        scene_of({each.recorded.slot: each for each in (one, camera)}).nodes["camera camera/1"]
+        for one in (image, image, newer)
+    )
+    assert first is again
+    assert first is not other
+
+
+@pytest.mark.parametrize(
+    ("pixels", "corner"),
+    [
+        (np.array([[7, 0], [0, 0]], np.uint8), [7, 7, 7]),
+        (np.array([[500, 100], [0, 0]], np.uint16), [255, 255, 255]),
+        (np.array([[np.nan, 1.0], [2.0, 3.0]], np.float32), [0, 0, 0]),
+    ],
+)
+def test_images_of_numbers_are_grey(pixels, corner):
+    node = one_node(shown(pixels, "image"))
+    assert node.image[0, 0].tolist() == corner
+
+
+def test_a_large_image_is_made_small():
+    node = one_node(shown(np.zeros((480, 640, 3), np.uint8), "image"))
+    assert node.image.shape == (240, 320, 3)
+
+
+# ---------------------------------------------------------------- poses, labels, files
+
+
+def test_a_pose_leaves_a_trail_that_a_step_back_ends():
+    trails = Trails()
+    nodes = [{"p": AxesNode("cell", moved(x_m))} for x_m in (0.0, 1.0, 2.0)]
+    assert trails.follow(nodes[0], 1) == {}
+    assert trails.follow(nodes[1], 2)["trail p"].places_m[:, 0].tolist() == [0.0, 1.0]
+    assert trails.follow(nodes[2], 3)["trail p"].places_m[:, 0].tolist() == [0.0, 1.0, 2.0]
+    assert trails.follow(nodes[1], 2) == {}
+
+
+def test_labels_stand_at_their_entities():
+    cloud = shown(
+        Cloud(np.array([[0, 0, 0], [2, 0, 0]], np.float32)), entity="pack/1", frame="tray"
+    )
+    scene = scene_of({cloud.recorded.slot: cloud})
+    (label,) = labels_of(scene, {"pack/1": "dented", "pack/2": "gone"}).values()
+    assert (label.text, label.frame, label.place_m.tolist()) == ("dented", "tray", [1.0, 0.0, 0.0])
+
+
+def test_a_mesh_is_a_file_that_others_read():
+    """Three vertices of three floats, one face with a count and three numbers."""
+    content = ply_of(shown(Mesh(np.eye(3), np.array([[0, 1, 2]]))))
+    head, body = content.split(b"end_header\n")
+    assert b"element vertex 3" in head
+    assert struct.unpack("<9f", body[:36]) == tuple(np.eye(3).ravel())
+    assert struct.unpack("<B3i", body[36:]) == (3, 0, 1, 2)
+
+
+def test_an_image_is_a_png_in_full_size():
+    imageio = pytest.importorskip("imageio.v3")
+    pixels = np.arange(400 * 3, dtype=np.uint8).reshape(1, 400, 3)
+    content = png_of(shown(pixels, "image"))
+    assert np.array_equal(imageio.imread(BytesIO(content)), pixels)
+
+
+@pytest.mark.parametrize("make", [ply_of, png_of])
+def test_a_datum_without_a_shape_is_no_file(make):
+    with pytest.raises(ConfigError, match="is shown as json"):
+        make(shown(1.5))
+
+
+def test_slots_of_samples_are_named():
+    assert str(slot("a/b", "c")) == "online:a/b/c"

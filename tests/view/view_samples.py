@@ -1,0 +1,22 @@
+"""Versions of data for the tests of the view, without a cell."""
+
+from enact_dist.config.shows import Shows
+from enact_dist.core.protocol.datum import Slot
+from enact_dist.recording.exact import Recorded
+from enact_dist.view.drawing.scene import shown_of
+from enact_dist.wire.payload import encode_datum
+
+SECOND_NS = 1_000_000_000
+BEGIN_NS = 1_700_000_000 * SECOND_NS
+
+
+def slot(entity, aspect="x", world="online"):
+    return Slot(world, entity, aspect)
+
+
+def shown(value, *kinds, entity="thing", aspect="x", version=1, **options):
+    """Return one version of a datum as the scene takes it."""
+    stamp_ns = BEGIN_NS + version * SECOND_NS
+    datum = encode_datum(value, type(value))
+    recorded = Recorded(slot(entity, aspect), version, stamp_ns, "left", 1, datum)
+    return shown_of(recorded, Shows(kinds, **options))
