@@ -10,6 +10,7 @@ import contextlib
 import threading
 import time
 from collections import deque
+from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from enact_dist.actor.report import read_reports
@@ -116,9 +117,7 @@ class Activity:
             # Asking takes at most a tenth of the time, however long the shards take.
             pause_s = max(EVERY_S, 9.0 * (time.monotonic() - begun_s))
             with self._news:
-                self._news.wait_for(
-                    lambda known=listed: self._stopped or self._listed != known, pause_s
-                )
+                self._news.wait_for(partial(self._is_over, listed), pause_s)
 
     def _is_over(self, listed: Mapping[object, frozenset[Slot]]) -> bool:
         """Whether a pause is over, because pages list something else."""
