@@ -149,7 +149,7 @@ class Activity:
             {
                 slot.partition(" (")[0]: lock_mark(lock)  # without how it is locked
                 for lock in locks
-                if lock.granted
+                if lock.granted and lock.kept != "unused"
                 for slot in lock.slots
             },
         )

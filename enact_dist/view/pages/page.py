@@ -245,7 +245,7 @@ class Page:
         if entry is not None and entry.cause is not None:
             facts.append(f"by {entry.cause.actor or '(unnamed)'}")
         held = self._viewer.activity_now().held.get(str(slot), "")
-        facts += [f"🔒 {held}"] if held else []
+        facts += [f"lock: {held}"] if held else []
         under = markup.text(" · ".join(filter(None, facts)))
         return f'<div style="margin-bottom:3px">{line}<div style="color:#888">{under}</div></div>'
 
@@ -300,7 +300,7 @@ class Page:
         lines = [markup.text(part) for part in (*parts, *self._remarks[:5])]
         wrong = [one for one in (feed.problem, self._said) if one]
         lines += [f'<span style="color:#b00">{markup.text(one)}</span>' for one in wrong]
-        self._status.show(markup.small("<br>".join(lines)))
+        self._status.show(markup.small("<br>".join([*lines, "&nbsp;"])))
 
     # ------------------------------------------------------------ events
 
