@@ -65,7 +65,8 @@ VERBS: Final = (
 
 def run_view(options: argparse.Namespace) -> int:
     """Serve pages until a signal."""
-    from enact_dist.view.pages.viewer import Viewer, ViewServer, require_viser
+    from enact_dist.view.pages.server import ViewServer, require_viser
+    from enact_dist.view.pages.viewer import Viewer
     from enact_dist.view.recorded import RecordingSource
 
     require_viser()

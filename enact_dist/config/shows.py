@@ -23,7 +23,11 @@ kind             takes the first part of the datum, in the order of its fields, 
 ``capsules``     an array (N, 7) of floats, metres: centre of one end, of the other, radius
 ``joints``       an array (J,) of floats, positions of joints in rad or m, or (T, J), of which the
                  last row counts; velocities if a second one of that shape stands beside; names from
-                 ``joints = ["…", …]`` in the aspect's table, else ``joint_1`` …
+                 ``joints = ["…", …]`` in the aspect's table, else ``joint_1`` …  `enact view` draws
+                 the arm if ``model`` names an aspect of the same entity whose datum has ``dh``
+                 (J, 4): d (m), a (m), alpha (rad), offset of theta (rad), classic; ``base`` (4, 4):
+                 the first frame in ``frame``; ``capsules`` (n, 5): frame (0 is the base), offset
+                 along its z (m), frame, offset (m), radius (m)
 ``pose``         a rigid (4, 4), metres: where the thing is in ``frame``
 ``transform``    a rigid (4, 4), metres: where ``frame`` is in ``parent``; with ``inverse = true``
                  in the aspect's table: where ``parent`` is in ``frame``
@@ -90,6 +94,7 @@ class Shows:
         voxel_m: Edge of a voxel if the datum has none; 0: the datum must have it.
         origin_m: Lowest corner of the grid of voxels if the datum has none.
         joints: Names of joints, in order.
+        model: Aspect of the same entity that is the model of an arm; see above.
         inverse: A transform gives the parent in the frame, not the frame in the parent.
 
     Raises:
@@ -104,6 +109,7 @@ class Shows:
     voxel_m: Annotated[float, TableKey(high=VOXEL_M_MAX)] = 0.0
     origin_m: tuple[float, ...] = (0.0, 0.0, 0.0)
     joints: tuple[str, ...] = ()
+    model: str = ""
     inverse: bool = False
 
     def __post_init__(self) -> None:

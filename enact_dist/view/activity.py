@@ -7,6 +7,7 @@ delays no page.
 from __future__ import annotations
 
 import contextlib
+import re
 import threading
 import time
 from collections import deque
@@ -25,10 +26,11 @@ if TYPE_CHECKING:
 
     from enact_dist.core.protocol.datum import Slot
     from enact_dist.core.protocol.messages import VersionEntry
-    from enact_dist.view.catalogue import Catalogue
+    from enact_dist.view.catalogue import SlotCatalogue
     from enact_dist.view.source import CellSource
     from enact_dist.world.listings import ActorInfo, LockInfo, ShardInfo
 
+_FIELDS: Final = re.compile(r"\{[^{}]*\}")
 EVERY_S: Final = 1.0
 WINDOW_S: Final = 10.0
 """Over which time a counter has to move to be shown."""
@@ -61,7 +63,7 @@ class Activity:
         now: What was found last.
     """
 
-    def __init__(self, source: CellSource, catalogue: Catalogue) -> None:
+    def __init__(self, source: CellSource, catalogue: SlotCatalogue) -> None:
         self._source, self._catalogue = source, catalogue
         self.now = CellActivity()
         self._entries: dict[Slot, VersionEntry] = {}
@@ -131,7 +133,7 @@ class Activity:
         self._entries = self._source.explained(asked)
         if any(slot.aspect not in self._types for slot, _ in asked):
             aspects = self._source.cell.aspects()
-            self._types = {name: kind.partition("(")[0] for name, (kind, _) in aspects.items()}
+            self._types = {name: type_name(kind) for name, (kind, _) in aspects.items()}
 
     def _ask(self) -> None:
         cell, now_s = self._source.cell, time.monotonic()
@@ -156,6 +158,14 @@ class Activity:
 
 
 # ---------------------------------------------------------------- tables
+
+
+def type_name(fingerprint: str) -> str:
+    """Return a type without the fields of its dataclasses."""
+    before = ""
+    while before != fingerprint:
+        before, fingerprint = fingerprint, _FIELDS.sub("", fingerprint)
+    return fingerprint
 
 
 def lock_mark(lock: LockInfo) -> str:

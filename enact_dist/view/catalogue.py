@@ -53,7 +53,7 @@ def _as_read(name: str) -> list[str | int]:
     return [int(part) if part.isdigit() else part for part in _NUMBERS.split(name)]
 
 
-class Catalogue:
+class SlotCatalogue:
     """All slots of a cell.  One thread writes it, any may list.
 
     Attributes:

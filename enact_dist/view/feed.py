@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.access.watch import Watch
 from enact_dist.core.protocol.datum import Slot
 from enact_dist.errors import EnactError, ProtocolError, ShardUnreachableError
-from enact_dist.view.catalogue import Catalogue, ListedState
-from enact_dist.view.drawing.scene import IN_SCENE, Shown, shown_of
+from enact_dist.view.catalogue import ListedState, SlotCatalogue
+from enact_dist.view.drawing.scene import IN_SCENE, ShownDatum, shown_of
 from enact_dist.view.source import RETRIED
 
 if TYPE_CHECKING:
@@ -75,13 +75,13 @@ class Feed:
     ) -> None:
         self._source, self.shows_of = source, shows_of
         self._rate_hz, self._bytes_s = rate_hz, bytes_s
-        self.catalogue = Catalogue()
+        self.catalogue = SlotCatalogue()
         self._trouble: dict[str, str] = {}
         self.passed_over = self.held_back = 0
         self.round_s = 0.0
         self.moment_ns = 0
         self._kinds: dict[str, frozenset[str]] = {}
-        self._shown: dict[Slot, Shown] = {}
+        self._shown: dict[Slot, ShownDatum] = {}
         self._wishes: dict[object, frozenset[Slot]] = {}
         self._away: dict[str, float] = {}
         self._budget, self._budget_s = bytes_s, time.monotonic()
@@ -117,7 +117,7 @@ class Feed:
                 self._wishes[page] = frozenset(slots)
             self._news.notify_all()
 
-    def shown(self, slots: Iterable[Slot]) -> dict[Slot, Shown]:
+    def shown(self, slots: Iterable[Slot]) -> dict[Slot, ShownDatum]:
         """Return the newest data of some slots, as far as they have come."""
         with self._news:
             return {slot: self._shown[slot] for slot in slots if slot in self._shown}

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 from enact_dist.errors import ProtocolError
 from enact_dist.recording.reading import Recording
-from enact_dist.view.catalogue import Catalogue, ListedState
-from enact_dist.view.drawing.scene import Shown, shown_of
+from enact_dist.view.catalogue import ListedState, SlotCatalogue
+from enact_dist.view.drawing.scene import ShownDatum, shown_of
 from enact_dist.view.feed import drawable
 from enact_dist.view.source import FoundData
 from enact_dist.view.timeline import Timeline
@@ -46,7 +46,7 @@ class RecordingSource:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self._recording = Recording(path)
         self.name = self._recording.path.name
-        self.catalogue = Catalogue()
+        self.catalogue = SlotCatalogue()
         self._guard = threading.Lock()
         self._state: dict[Slot, Recorded] = {}
         self._commits: Iterator[RecordedCommit] = iter(())
@@ -122,7 +122,7 @@ class RecordingFeed:
     def wish(self, page: object, slots: Iterable[Slot] | None) -> None:
         """Do nothing: all data are in the file."""
 
-    def shown(self, slots: Iterable[Slot]) -> dict[Slot, Shown]:
+    def shown(self, slots: Iterable[Slot]) -> dict[Slot, ShownDatum]:
         """Return nothing: a recording has no present."""
         return {}
 

@@ -45,7 +45,7 @@ def ball_at(x_m):
     return np.array([[x_m, 0.0, 0.0, x_m, 0.0, 0.0, 0.5]])
 
 
-class Shown:
+class Served:
     """The cell, its shard and its view as processes, and a session that writes."""
 
     def __init__(self, folder, stack):
@@ -87,7 +87,7 @@ class Shown:
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory):
     with contextlib.ExitStack() as stack:
-        yield Shown(tmp_path_factory.mktemp("shown"), stack)
+        yield Served(tmp_path_factory.mktemp("shown"), stack)
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from enact_dist.recording import Recorder
 from enact_dist.view.activity import Activity
 from enact_dist.view.feed import Feed
 from enact_dist.view.pages.comparing import MARKED, NOW, Side
-from enact_dist.view.pages.contents import Contents
+from enact_dist.view.pages.contents import PageContents
 from enact_dist.view.pages.datum import Lineage, Samples
 from enact_dist.view.pages.viewer import Viewer, ViewSettings
 from enact_dist.view.recorded import RecordingFeed, RecordingSource
@@ -69,7 +69,7 @@ def feed(cell):
 
 def contents_of(cell, feed):
     viewer = Viewer.compare
-    return Contents(feed, CellSource(cell), lambda *sides: viewer(Shim(cell), *sides))
+    return PageContents(feed, CellSource(cell), lambda *sides: viewer(Shim(cell), *sides))
 
 
 class Shim:
@@ -221,6 +221,6 @@ def test_a_recording_is_a_past(cell, tmp_path):
     feed = RecordingFeed(source, lambda aspect: SHOWS.get(aspect, GUESSED))
     assert feed.in_scene(source.catalogue.slots("online")) == [SLOT]
     for position, x_m in ((positions[2], 3.0), (positions[0], 1.0), (positions[1], 2.0)):
-        contents = Contents(feed, source, lambda *_: None)
+        contents = PageContents(feed, source, lambda *_: None)
         contents.player.look_back(source.timeline, position.stamp_ns)
         assert contents.data([SLOT])[SLOT].value[0, 3] == x_m

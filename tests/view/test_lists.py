@@ -7,7 +7,7 @@ import pytest
 from view_samples import BEGIN_NS, SECOND_NS, slot
 
 from enact_dist.view import markup
-from enact_dist.view.catalogue import ROWS_MAX, Catalogue, ListedState
+from enact_dist.view.catalogue import ROWS_MAX, ListedState, SlotCatalogue
 from enact_dist.view.timeline import Player, Timeline
 
 
@@ -69,7 +69,7 @@ def test_playing_goes_on_at_its_speed_and_stops_at_the_end():
 
 
 def filled(*slots):
-    catalogue = Catalogue()
+    catalogue = SlotCatalogue()
     for number, each in enumerate(slots, 1):
         state = ListedState(1, BEGIN_NS + number, null=False)
         catalogue.note(each, state, gap=0, now_s=0.0)

@@ -16,17 +16,15 @@ from enact_dist.recording.drawing.solids import outer_voxels, voxel_faces
 from enact_dist.view.drawing import scene as scenes
 from enact_dist.view.drawing.files import ply_of, png_of
 from enact_dist.view.drawing.frames import InParent, placed
-from enact_dist.view.drawing.scene import (
+from enact_dist.view.drawing.nodes import (
     AxesNode,
     CapsulesNode,
     CubesNode,
     FrustumNode,
     PointsNode,
     SurfaceNode,
-    extent_of,
-    labels_of,
-    scene_of,
 )
+from enact_dist.view.drawing.scene import extent_of, labels_of, scene_of
 from enact_dist.view.drawing.shapes import capsule_bodies, capsule_ends, linear
 from enact_dist.view.drawing.trails import Trails
 
@@ -164,6 +162,28 @@ def test_capsules_are_spheres_and_cylinders():
     assert ends.places_m.tolist() == [[0, 0, 0], [0, 0, 2]]
     assert ends.sizes_m.tolist() == [[0.5] * 3] * 2
     assert (bodies.places_m.tolist(), bodies.sizes_m.tolist()) == ([[0, 0, 1]], [[0.5, 0.5, 2.0]])
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    dh: np.ndarray
+    base: np.ndarray
+    capsules: np.ndarray
+
+
+def test_an_arm_stands_as_its_joints_say():
+    """Two links of 1 m in a plane; the second joint is bent by a quarter turn."""
+    links = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]])
+    shapes = np.array([[0, 0, 1, 0, 0.1], [1, 0, 2, 0, 0.05]], np.float64)
+    model = shown(Model(links, moved(0.0, 0.0, 0.5), shapes), entity="arm", aspect="model")
+    joints = shown(np.array([0.0, np.pi / 2]), "joints", entity="arm", frame="cell", model="model")
+    data = {one.recorded.slot: one for one in (model, joints)}
+    (node,) = scene_of(data).nodes.values()
+    assert node is next(iter(scene_of(data).nodes.values()))
+    first, second = (capsule.ends_m for capsule in node.capsules)
+    assert np.allclose(first, [[0, 0, 0.5], [1, 0, 0.5]])
+    assert np.allclose(second, [[1, 0, 0.5], [1, 1, 0.5]])
+    assert scene_of({joints.recorded.slot: joints}).nodes == {}
 
 
 def test_a_datum_that_does_not_fit_its_kind_is_left_out():

@@ -15,10 +15,10 @@ from enact_dist.view.drawing.pixels import rgb_of
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from enact_dist.view.drawing.scene import Shown
+    from enact_dist.view.drawing.scene import ShownDatum
 
 
-def png_of(shown: Shown) -> bytes:
+def png_of(shown: ShownDatum) -> bytes:
     """Return the image of a datum in its full size.
 
     Raises:
@@ -34,7 +34,7 @@ def png_of(shown: Shown) -> bytes:
     raise ConfigError(f"{shown.recorded.slot} is shown as {_kinds(shown)}, so it has no image")
 
 
-def ply_of(shown: Shown) -> bytes:
+def ply_of(shown: ShownDatum) -> bytes:
     """Return the cloud, mesh or voxels of a datum as binary PLY, metres.
 
     Raises:
@@ -53,7 +53,7 @@ def ply_of(shown: Shown) -> bytes:
     )
 
 
-def _kinds(shown: Shown) -> str:
+def _kinds(shown: ShownDatum) -> str:
     return " and ".join(shown.drawables) or "null"
 
 

@@ -13,6 +13,7 @@ from enact_dist.recording.drawing.drawables import (
     ShownCapsules,
     ShownCloud,
     ShownImage,
+    ShownJoints,
     ShownMesh,
     ShownPose,
     ShownTransform,
@@ -20,7 +21,18 @@ from enact_dist.recording.drawing.drawables import (
     drawables_of,
 )
 from enact_dist.recording.drawing.solids import outer_voxels
+from enact_dist.view.drawing.arms import arm_capsules
 from enact_dist.view.drawing.frames import InParent, placed
+from enact_dist.view.drawing.nodes import (
+    AxesNode,
+    CapsulesNode,
+    CubesNode,
+    FrustumNode,
+    LabelNode,
+    Node,
+    PointsNode,
+    SurfaceNode,
+)
 from enact_dist.view.drawing.pixels import rgb_of, with_mask
 from enact_dist.wire.payload import decode_untyped
 
@@ -32,7 +44,6 @@ if TYPE_CHECKING:
     from enact_dist.config.shows import Shows
     from enact_dist.core.protocol.datum import Slot
     from enact_dist.recording.drawing.drawables import Drawable
-    from enact_dist.recording.drawing.solids import Capsule
     from enact_dist.recording.exact import Recorded
 
     Colour = tuple[int, int, int]
@@ -48,18 +59,19 @@ FIELD_RAD: Final = math.radians(50.0)
 """Vertical field of an image whose camera is not known."""
 IN_SCENE: Final = frozenset(
     ("image", "mask", "point_cloud", "mesh", "voxels", "capsules", "pose", "transform",
-     "calibration")
+     "calibration", "joints")
 )  # fmt: skip
 """Kinds of `enact_dist.config.shows` that the scene shows; the others are values in the tree."""
 CLOUD_COLOUR: Final = (60, 90, 140)
 MESH_COLOUR: Final = (170, 172, 180)
 VOXEL_COLOUR: Final = (242, 140, 38)
 CAPSULE_COLOUR: Final = (64, 128, 217)
+ARM_COLOUR: Final = (225, 120, 20)
 FRUSTUM_COLOUR: Final = (40, 40, 40)
 
 
 @dataclass(eq=False, slots=True)
-class Shown:
+class ShownDatum:
     """One version of a datum and what can be shown of it.
 
     Attributes:
@@ -77,94 +89,16 @@ class Shown:
     made: dict[object, Any] = field(default_factory=dict)
 
 
-def shown_of(recorded: Recorded, shows: Shows) -> Shown:
+def shown_of(recorded: Recorded, shows: Shows) -> ShownDatum:
     """Return what can be shown of a version.
 
     Raises:
         ProtocolError: The datum cannot be decoded.
     """
     if recorded.datum is None:
-        return Shown(recorded, None, shows, {})
+        return ShownDatum(recorded, None, shows, {})
     value = decode_untyped(recorded.datum)
-    return Shown(recorded, value, shows, drawables_of(value, shows))
-
-
-# ---------------------------------------------------------------- nodes
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Node:
-    """A thing in the scene, in the coordinates of its frame; the same object is drawn once."""
-
-    frame: str
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class PointsNode(Node):
-    """Points (N, 3), metres, with one colour, or (N, 3) uint8; as squares of `size_m`, or round."""
-
-    points_m: NDArray[np.float32]
-    colours: NDArray[np.uint8] | Colour
-    size_m: float = 0.0
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class SurfaceNode(Node):
-    """Triangles (M, 3) over vertices (N, 3), metres."""
-
-    vertices_m: NDArray[np.float32]
-    triangles: NDArray[np.uint32]
-    colour: Colour
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class CubesNode(Node):
-    """Cubes with an edge of `edge_m` around centres (N, 3)."""
-
-    centres_m: NDArray[np.float32]
-    edge_m: float
-    colour: Colour
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class CapsulesNode(Node):
-    """Capsules, at least one."""
-
-    capsules: tuple[Capsule, ...]
-    colour: Colour
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class AxesNode(Node):
-    """Axes at a rigid (4, 4)."""
-
-    matrix: NDArray[Any]
-    colour: Colour | None = None
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class TrailNode(Node):
-    """A line through places (N, 3), N > 1."""
-
-    places_m: NDArray[np.float32]
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class FrustumNode(Node):
-    """A camera, looking along z, with its image (H, W, 3) uint8 or without one."""
-
-    field_rad: float
-    aspect: float
-    image: NDArray[np.uint8] | None
-    colour: Colour
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class LabelNode(Node):
-    """A text at a place (3,)."""
-
-    text: str
-    place_m: NDArray[np.float64]
+    return ShownDatum(recorded, value, shows, drawables_of(value, shows))
 
 
 class SceneView(NamedTuple):
@@ -182,10 +116,10 @@ class SceneView(NamedTuple):
 
 
 def scene_of(
-    data: Mapping[Slot, Shown],
+    data: Mapping[Slot, ShownDatum],
     *,
     tints: Mapping[Slot, Colour] | None = None,
-    frames_of: Mapping[Slot, Shown] | None = None,
+    frames_of: Mapping[Slot, ShownDatum] | None = None,
 ) -> SceneView:
     """Return the scene of the data of one moment.
 
@@ -202,6 +136,10 @@ def scene_of(
         tint = tints.get(slot)
         for kind, drawable in shown.drawables.items():
             made = _made(shown, kind, drawable, tint)
+            if isinstance(drawable, ShownJoints):
+                made = _arm(
+                    shown, drawable, data.get(slot._replace(aspect=shown.shows.model)), tint
+                )
             if made is not None:
                 nodes[f"{slot}#{kind}"] = made
             remarks += _thinned(slot, drawable)
@@ -217,7 +155,7 @@ def scene_of(
     return SceneView(nodes, frames.poses, tuple(remarks))
 
 
-def _transforms(data: Iterable[Shown]) -> Iterator[tuple[str, InParent]]:
+def _transforms(data: Iterable[ShownDatum]) -> Iterator[tuple[str, InParent]]:
     for shown in data:
         found, entity = shown.drawables.get("transform"), shown.recorded.slot.entity
         if isinstance(found, ShownTransform):
@@ -225,7 +163,9 @@ def _transforms(data: Iterable[Shown]) -> Iterator[tuple[str, InParent]]:
             yield shown.shows.frame_of(entity), InParent(parent, found.matrix)
 
 
-def _made(shown: Shown, kind: str, drawable: Drawable | None, tint: Colour | None) -> Node | None:
+def _made(
+    shown: ShownDatum, kind: str, drawable: Drawable | None, tint: Colour | None
+) -> Node | None:
     """Return the node of a drawable, made once; None if it is none, or empty."""
     key = ("node", kind, tint)
     if key not in shown.made:
@@ -266,6 +206,22 @@ def _node(frame: str, drawable: Drawable | None, tint: Colour | None) -> Node | 
     return None
 
 
+def _arm(
+    shown: ShownDatum, joints: ShownJoints, model: ShownDatum | None, tint: Colour | None
+) -> Node | None:
+    """Return an arm at the positions of its joints; None without a model that fits."""
+    if model is None:
+        return None
+    key = ("arm", tint, id(model))
+    if key not in shown.made:
+        capsules = arm_capsules(model.value, joints.positions)
+        frame = shown.shows.frame_of(shown.recorded.slot.entity)
+        node = CapsulesNode(frame, capsules, tint or ARM_COLOUR) if capsules else None
+        shown.made[key] = node, model  # referenced, so that its id stays its own
+    arm: Node | None = shown.made[key][0]
+    return arm
+
+
 def _stride(count: int) -> int:
     return -(-count // POINTS_MAX)
 
@@ -298,13 +254,15 @@ def _thinned(slot: Slot, drawable: Drawable | None) -> Iterator[str]:
 class _Camera:
     """What is known of the camera of a frame."""
 
-    image: Shown | None = None
-    masks: list[Shown] = field(default_factory=list)
-    calibration: Shown | None = None
+    image: ShownDatum | None = None
+    masks: list[ShownDatum] = field(default_factory=list)
+    calibration: ShownDatum | None = None
     tint: Colour | None = None
 
 
-def _frustums(data: Mapping[Slot, Shown], tints: Mapping[Slot, Colour]) -> dict[str, FrustumNode]:
+def _frustums(
+    data: Mapping[Slot, ShownDatum], tints: Mapping[Slot, Colour]
+) -> dict[str, FrustumNode]:
     cameras: dict[str, _Camera] = {}
     for slot, shown in data.items():
         frame = shown.shows.frame_of(slot.entity)

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from enact_dist.view.drawing.scene import AxesNode, TrailNode
+from enact_dist.view.drawing.nodes import AxesNode, TrailNode
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from enact_dist.view.drawing.scene import Node
+    from enact_dist.view.drawing.nodes import Node
 
 PLACES_MAX: Final = 200
 """Places of one trail."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from enact_dist.recording.drawing.geometry import quaternion
-from enact_dist.view.drawing.scene import (
+from enact_dist.view.drawing.nodes import (
     AxesNode,
     CapsulesNode,
     CubesNode,

@@ -34,7 +34,7 @@ class Side(NamedTuple):
     at_ns: int
 
 
-class Comparing:
+class ShownDifference:
     """Makes the difference and colours it.
 
     Args:

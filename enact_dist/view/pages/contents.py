@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, Protocol
 
-from enact_dist.view.drawing.scene import SceneView, Shown, labels_of, scene_of, shown_of
+from enact_dist.view.drawing.scene import SceneView, ShownDatum, labels_of, scene_of, shown_of
 from enact_dist.view.drawing.trails import Trails
 from enact_dist.view.markup import short_value
-from enact_dist.view.pages.comparing import Comparing, Side
+from enact_dist.view.pages.comparing import ShownDifference, Side
 from enact_dist.view.timeline import Player, Timeline
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from enact_dist.compare.diff import Diff
     from enact_dist.config.shows import Shows
     from enact_dist.core.protocol.datum import Slot
-    from enact_dist.view.catalogue import Catalogue
+    from enact_dist.view.catalogue import SlotCatalogue
     from enact_dist.view.source import DataSource
 
 SCENE_MAX: Final = 256
@@ -28,7 +28,7 @@ OTHERS_MAX: Final = 64
 class Present(Protocol):
     """What pages ask of a feed."""
 
-    catalogue: Catalogue
+    catalogue: SlotCatalogue
     shows_of: Callable[[str], Shows]
     moment_ns: int
     passed_over: int
@@ -41,14 +41,14 @@ class Present(Protocol):
     def wish(self, page: object, slots: Iterable[Slot] | None) -> None:
         """Set which data a page shows."""
 
-    def shown(self, slots: Iterable[Slot]) -> dict[Slot, Shown]:
+    def shown(self, slots: Iterable[Slot]) -> dict[Slot, ShownDatum]:
         """Return the newest data of some slots."""
 
     def in_scene(self, slots: Iterable[Slot]) -> list[Slot]:
         """Return the slots that the scene can show."""
 
 
-class Contents:
+class PageContents:
     """What one page shows.  Used by one thread.
 
     Args:
@@ -78,13 +78,13 @@ class Contents:
         self.hidden: set[str] = set()
         self.label = ""
         self.trails = True
-        self.comparing = Comparing(compare)
+        self.comparing = ShownDifference(compare)
         self.forgotten: tuple[Slot, ...] = ()
         self.left_out = 0
         self._trails = Trails()
-        self._past: dict[Slot, Shown] = {}
+        self._past: dict[Slot, ShownDatum] = {}
         self._past_key: tuple[object, ...] = ()
-        self._others: dict[Slot, Shown] = {}
+        self._others: dict[Slot, ShownDatum] = {}
         self._others_key: object = None
 
     @property
@@ -97,10 +97,16 @@ class Contents:
         return self._feed.in_scene(self._feed.catalogue.slots(self.world))
 
     def drawn(self, drawable: Iterable[Slot]) -> list[Slot]:
-        """Return the data to draw of those that a scene can show."""
+        """Return the data to draw of those that a scene can show, and the models of arms."""
         found = [slot for slot in drawable if slot.aspect not in self.hidden]
         self.left_out = max(0, len(found) - SCENE_MAX)
-        return found[:SCENE_MAX]
+        drawn = found[:SCENE_MAX]
+        models = [
+            slot._replace(aspect=model)
+            for slot in drawn
+            if (model := self._feed.shows_of(slot.aspect).model)
+        ]
+        return list(dict.fromkeys([*drawn, *models]))
 
     def labelled(self) -> list[Slot]:
         """Return the data that are labels."""
@@ -118,7 +124,7 @@ class Contents:
         timeline = Timeline.of(self._source.histories(slots))
         self.player.look_back(timeline.including([at_ns]) if at_ns else timeline, at_ns)
 
-    def data(self, slots: Sequence[Slot]) -> dict[Slot, Shown]:
+    def data(self, slots: Sequence[Slot]) -> dict[Slot, ShownDatum]:
         """Return data as of the moment.
 
         Raises:
@@ -134,11 +140,11 @@ class Contents:
         return self._past
 
     def _as_of(
-        self, slots: Sequence[Slot], at_ns: int, before: dict[Slot, Shown]
-    ) -> tuple[dict[Slot, Shown], tuple[Slot, ...]]:
+        self, slots: Sequence[Slot], at_ns: int, before: dict[Slot, ShownDatum]
+    ) -> tuple[dict[Slot, ShownDatum], tuple[Slot, ...]]:
         """Return data as of a moment; of a version that was shown before, the same object."""
         found = self._source.data_at(slots, at_ns)
-        shown: dict[Slot, Shown] = {}
+        shown: dict[Slot, ShownDatum] = {}
         for slot, recorded in found.data.items():
             old = before.get(slot)
             same = old is not None and (old.recorded.version, old.recorded.stamp_ns) == (
@@ -152,7 +158,7 @@ class Contents:
             )
         return shown, found.forgotten
 
-    def scenes(self, data: dict[Slot, Shown]) -> dict[str, SceneView]:
+    def scenes(self, data: dict[Slot, ShownDatum]) -> dict[str, SceneView]:
         """Return the scene of the moment and, of a difference, what the other side has.
 
         Raises:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from enact_dist.config.shows import Shows
     from enact_dist.core.protocol.datum import Slot
-    from enact_dist.view.drawing.scene import Shown
+    from enact_dist.view.drawing.scene import ShownDatum
     from enact_dist.view.source import CellSource
     from enact_dist.world.lineage import CauseTree, EffectTree, Made
 
@@ -37,7 +37,7 @@ class Samples:
     def __init__(self) -> None:
         self._known: dict[Slot, deque[tuple[int, dict[str, float]]]] = {}
 
-    def add(self, shown: Shown) -> None:
+    def add(self, shown: ShownDatum) -> None:
         """Take a version, unless it is known or older."""
         recorded = shown.recorded
         if recorded.datum is not None and recorded.datum.size <= SMALL_BYTES:
@@ -92,7 +92,7 @@ class Lineage:
         self.steps: dict[str, tuple[Slot, int]] = {}
         self._tree: CauseTree | EffectTree | None = None
 
-    def ask(self, source: CellSource, shown: Shown, way: str) -> None:
+    def ask(self, source: CellSource, shown: ShownDatum, way: str) -> None:
         """Ask for the causes (``why``) or the effects (``impact``) of a version."""
         recorded = shown.recorded
         follow = source.cell.why if way == "why" else source.cell.impact
@@ -127,7 +127,7 @@ class Lineage:
         return f"{len(versions)} versions are kept under {label}; enact world unpin ends that"
 
 
-def file_of(shown: Shown, kind: str) -> tuple[str, bytes]:
+def file_of(shown: ShownDatum, kind: str) -> tuple[str, bytes]:
     """Return a datum as a file: its name, its bytes.
 
     Args:

@@ -13,7 +13,7 @@ from enact_dist.view import markup
 from enact_dist.view.drawing.scene import extent_of
 from enact_dist.view.pages.canvas import Canvas
 from enact_dist.view.pages.comparing import MARKED, NOW
-from enact_dist.view.pages.contents import Contents
+from enact_dist.view.pages.contents import PageContents
 from enact_dist.view.pages.datum import SMALL_BYTES, Lineage, Samples, file_of, recording_of
 from enact_dist.view.pages.panels import CellPanel, DatumPanel, Text, TimePanel, TreePanel
 from enact_dist.world.trees import shown_s
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from enact_dist.core.protocol.datum import Slot
     from enact_dist.view.catalogue import Listing
-    from enact_dist.view.drawing.scene import SceneView, Shown
+    from enact_dist.view.drawing.scene import SceneView, ShownDatum
     from enact_dist.view.pages.viewer import Viewer
 
 LISTED_S: Final = 0.5
@@ -48,7 +48,7 @@ class Page:
         self._viewer, self._client = viewer, client
         self._events: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
         self._closed = False
-        self.contents = Contents(viewer.feed, viewer.source, viewer.compare)
+        self.contents = PageContents(viewer.feed, viewer.source, viewer.compare)
         self._canvas = Canvas(client)
         self._lineage, self._samples = Lineage(), Samples()
         self._path = self._filter = self._said = ""
@@ -156,7 +156,7 @@ class Page:
         if listing_due:
             self._show_panels(data)
 
-    def _draw(self, data: dict[Slot, Shown], *, fits: bool) -> None:
+    def _draw(self, data: dict[Slot, ShownDatum], *, fits: bool) -> None:
         scenes = self.contents.scenes(data)
         if fits and scenes[""].nodes:
             self._fit(scenes[""])
@@ -200,7 +200,7 @@ class Page:
                 followed.append(slot)
         return followed
 
-    def _show_panels(self, data: Mapping[Slot, Shown]) -> None:
+    def _show_panels(self, data: Mapping[Slot, ShownDatum]) -> None:
         contents, player, listing = self.contents, self.contents.player, self._listing
         assert listing is not None
         rows = [self._row(slot, data.get(slot)) for slot in listing.slots]
@@ -229,7 +229,7 @@ class Page:
         self._time.show(markup.small(self._when()), live=player.live, playing=player.playing)
         self._show_status()
 
-    def _row(self, slot: Slot, shown: Shown | None) -> str:
+    def _row(self, slot: Slot, shown: ShownDatum | None) -> str:
         catalogue, now_s = self._viewer.feed.catalogue, time.monotonic()
         entry, state = self._viewer.entry(slot), catalogue.state(slot)
         name = markup.slot_name(slot).removeprefix("" if self._filter else self._path)
@@ -249,7 +249,7 @@ class Page:
         under = markup.text(" · ".join(filter(None, facts)))
         return f'<div style="margin-bottom:3px">{line}<div style="color:#888">{under}</div></div>'
 
-    def _datum_content(self, data: Mapping[Slot, Shown]) -> str:
+    def _datum_content(self, data: Mapping[Slot, ShownDatum]) -> str:
         if self._datum is None:
             return markup.small("choose a datum in the tab world")
         head = f"<b>{markup.text(self._datum)}</b>"
@@ -409,7 +409,7 @@ class Page:
             name, content = file_of(shown, kind)
         self._client.send_file_download(name, content, save_immediately=True)
 
-    def _chosen(self) -> Shown | None:
+    def _chosen(self) -> ShownDatum | None:
         """Return the chosen datum as of the moment; say on the page if there is none."""
         shown = self.contents.data([self._datum]).get(self._datum) if self._datum else None
         if shown is None:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     """Takes the name of an event and its value; returns at once."""
 
 NONE: Final = "-"
-"""Shown where nothing is chosen."""
+"""ShownDatum where nothing is chosen."""
 SPEEDS: Final = ("0.1", "0.25", "0.5", "1", "2", "5", "10")
 BRANCHES_MAX: Final = 30
 

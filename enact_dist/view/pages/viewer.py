@@ -1,30 +1,22 @@
-"""What all pages share, and the server that brings them to browsers."""
+"""What all pages share: a cell or a recording, its feed, and what they may ask."""
 
 from __future__ import annotations
 
-import contextlib
-import io
-import threading
-import warnings
 from dataclasses import dataclass, field
-from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.access.watch import Closing
 from enact_dist.config.shows import GUESSED
 from enact_dist.core.protocol.datum import Position
-from enact_dist.errors import ConfigError, MisuseError
+from enact_dist.errors import MisuseError
 from enact_dist.view.activity import Activity, CellActivity
 from enact_dist.view.feed import Feed
-from enact_dist.view.pages.page import Page
 from enact_dist.view.recorded import RecordingFeed, RecordingSource
 from enact_dist.view.source import CellSource
 from enact_dist.view.timeline import Timeline
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
-
-    from viser import ClientHandle
 
     from enact_dist.compare.diff import Diff
     from enact_dist.config.shows import Shows
@@ -37,19 +29,6 @@ if TYPE_CHECKING:
 
 BYTES_S: Final = 150e6
 RATE_HZ: Final = 10.0
-
-
-def require_viser() -> None:
-    """Make sure that pages can be served.
-
-    Raises:
-        ConfigError: viser is not installed; the message names the extra that brings it.
-    """
-    if find_spec("viser") is None:
-        raise ConfigError(
-            "the view needs viser, which this Python does not have: install the extra 'view'"
-            " (pip install -e '.[view]' in the clone of enact-dist)"
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,8 +69,6 @@ class Viewer(Closing):
     def __init__(self, shown: Cell | RecordingSource, settings: ViewSettings) -> None:
         self.shows, self.world = settings.shows, settings.world
         self.rate_hz, self._settings = settings.rate_hz, settings
-        self._pages: dict[int, Page] = {}
-        self._guard = threading.Lock()
         self.timeline = Timeline()
         self._activity: Activity | None = None
         self.feed: Feed | RecordingFeed
@@ -113,28 +90,8 @@ class Viewer(Closing):
     def _shows_of(self, aspect: str) -> Shows:
         return self.shows.get(aspect, GUESSED)
 
-    # ------------------------------------------------------------ pages
-
-    def open_page(self, client: ClientHandle) -> None:
-        """Show a page in a browser that has connected."""
-        page = Page(self, client)
-        with self._guard:
-            self._pages[client.client_id] = page
-        page.start()
-
-    def close_page(self, client: ClientHandle) -> None:
-        """End the page of a browser that has gone."""
-        with self._guard:
-            page = self._pages.pop(client.client_id, None)
-        if page is not None:
-            page.close()
-
     def close(self) -> None:
-        """End all pages and threads; twice is harmless."""
-        with self._guard:
-            pages, self._pages = self._pages, {}
-        for page in pages.values():
-            page.close()
+        """End its threads; twice is harmless."""
         if self._activity is not None:
             self._activity.stop()
         if isinstance(self.feed, Feed):
@@ -187,47 +144,3 @@ class Viewer(Closing):
 def _moment(at_ns: int) -> Position:
     """Return a timestamp as `WorldContext.at` takes it; seconds as a float would round it."""
     return Position(at_ns, "")
-
-
-class ViewServer(Closing):
-    """The server of the pages; also a context manager.
-
-    Args:
-        viewer: What they show.
-        host: Address to listen on.
-        port: Port; the next free one if it is taken.
-
-    Raises:
-        ConfigError: viser is not installed.
-    """
-
-    def __init__(self, viewer: Viewer, *, host: str = "127.0.0.1", port: int = 8080) -> None:
-        require_viser()
-        from enact_dist.view.pages.unshared import UnsharedServer
-
-        # A browser may go while its page draws: what is on its way then is no loss.
-        warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
-        with contextlib.redirect_stdout(io.StringIO()):  # its own table of addresses
-            self._server = UnsharedServer(host, port, label=viewer.name, verbose=False)
-        self._server.gui.configure_theme(
-            show_share_button=False, show_logo=False, control_width="large"
-        )
-        # viser's own light makes colours pale, and its shadows cost a browser without a graphics
-        # card most of its time.
-        scene = self._server.scene
-        scene.configure_default_lights(enabled=False)
-        scene.configure_environment_map(None)
-        scene.add_light_ambient("/light/around", intensity=2.2)
-        scene.add_light_directional(
-            "/light/above", intensity=1.5, position=(1.0, -2.0, 3.0), cast_shadow=False
-        )
-        self._server.on_client_connect(viewer.open_page)
-        self._server.on_client_disconnect(viewer.close_page)
-        self.port = self._server.get_port()
-
-    def close(self) -> None:
-        """End it."""
-        self._server.stop()
-
-    def __enter__(self) -> Self:
-        return self

@@ -1,0 +1,92 @@
+"""The server of the pages: one page for each browser."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import threading
+import warnings
+from importlib.util import find_spec
+from typing import TYPE_CHECKING
+
+from enact_dist.access.watch import Closing
+from enact_dist.errors import ConfigError
+from enact_dist.view.pages.page import Page
+
+if TYPE_CHECKING:
+    from viser import ClientHandle
+
+    from enact_dist.view.pages.viewer import Viewer
+
+
+def require_viser() -> None:
+    """Make sure that pages can be served.
+
+    Raises:
+        ConfigError: viser is not installed; the message names the extra that brings it.
+    """
+    if find_spec("viser") is None:
+        raise ConfigError(
+            "the view needs viser, which this Python does not have: install the extra 'view'"
+            " (pip install -e '.[view]' in the clone of enact-dist)"
+        )
+
+
+class ViewServer(Closing):
+    """The server of the pages; also a context manager.
+
+    Args:
+        viewer: What they show.
+        host: Address to listen on.
+        port: Port; the next free one if it is taken.
+
+    Raises:
+        ConfigError: viser is not installed.
+    """
+
+    def __init__(self, viewer: Viewer, *, host: str = "127.0.0.1", port: int = 8080) -> None:
+        require_viser()
+        from enact_dist.view.pages.unshared import UnsharedServer
+
+        # A browser may go while its page draws: what is on its way then is no loss.
+        warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
+        with contextlib.redirect_stdout(io.StringIO()):  # its own table of addresses
+            self._server = UnsharedServer(host, port, label=viewer.name, verbose=False)
+        self._server.gui.configure_theme(
+            show_share_button=False, show_logo=False, control_width="large"
+        )
+        # viser's own light makes colours pale, and its shadows cost a browser without a graphics
+        # card most of its time.
+        scene = self._server.scene
+        scene.configure_default_lights(enabled=False)
+        scene.configure_environment_map(None)
+        scene.add_light_ambient("/light/around", intensity=2.2)
+        scene.add_light_directional(
+            "/light/above", intensity=1.5, position=(1.0, -2.0, 3.0), cast_shadow=False
+        )
+        self._viewer = viewer
+        self._pages: dict[int, Page] = {}
+        self._guard = threading.Lock()
+        self._server.on_client_connect(self._open)
+        self._server.on_client_disconnect(self._close)
+        self.port = self._server.get_port()
+
+    def _open(self, client: ClientHandle) -> None:
+        page = Page(self._viewer, client)
+        with self._guard:
+            self._pages[client.client_id] = page
+        page.start()
+
+    def _close(self, client: ClientHandle) -> None:
+        with self._guard:
+            page = self._pages.pop(client.client_id, None)
+        if page is not None:
+            page.close()
+
+    def close(self) -> None:
+        """End it and all pages."""
+        with self._guard:
+            pages, self._pages = self._pages, {}
+        for page in pages.values():
+            page.close()
+        self._server.stop()
