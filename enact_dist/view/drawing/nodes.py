@@ -24,11 +24,15 @@ class Node:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PointsNode(Node):
-    """Points (N, 3), metres, with one colour, or (N, 3) uint8; as squares of `size_m`, or round."""
+    """Points (N, 3), metres, with one colour, or (N, 3) uint8; as squares of `size_m`, or round.
+
+    They are one in `one_in` of those that the datum has.
+    """
 
     points_m: NDArray[np.float32]
     colours: NDArray[np.uint8] | Colour
     size_m: float = 0.0
+    one_in: int = 1
 
 
 @dataclass(frozen=True, eq=False, slots=True)

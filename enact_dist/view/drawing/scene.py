@@ -142,7 +142,7 @@ def scene_of(
                 )
             if made is not None:
                 nodes[f"{slot}#{kind}"] = made
-            remarks += _thinned(slot, drawable)
+            remarks += _thinned(slot, drawable, made)
     for frame, frustum in _frustums(data, tints).items():
         nodes[f"camera {frame}"] = frustum
     asked = dict.fromkeys([*(node.frame for node in nodes.values()), *transforms])
@@ -197,7 +197,8 @@ def _node(frame: str, drawable: Drawable | None, tint: Colour | None) -> Node | 
         centres = middles.astype(np.float32)
         colour = tint or VOXEL_COLOUR
         if len(centres) > CUBES_MAX:
-            return PointsNode(frame, centres[:: _stride(len(centres))], colour, drawable.voxel_m)
+            step = _stride(len(centres))
+            return PointsNode(frame, centres[::step], colour, drawable.voxel_m, step)
         return CubesNode(frame, centres, drawable.voxel_m, colour)
     if isinstance(drawable, ShownCapsules) and drawable.capsules:
         return CapsulesNode(frame, drawable.capsules, tint or CAPSULE_COLOUR)
@@ -234,15 +235,14 @@ def _points(frame: str, cloud: ShownCloud, tint: Colour | None) -> PointsNode | 
     if not there.any():
         return None
     if tint is not None or cloud.colours is None:
-        return PointsNode(frame, points[there], tint or CLOUD_COLOUR)
-    return PointsNode(frame, points[there], np.ascontiguousarray(cloud.colours[::step][there]))
+        return PointsNode(frame, points[there], tint or CLOUD_COLOUR, 0.0, step)
+    colours = np.ascontiguousarray(cloud.colours[::step][there])
+    return PointsNode(frame, points[there], colours, 0.0, step)
 
 
-def _thinned(slot: Slot, drawable: Drawable | None) -> Iterator[str]:
-    count = len(drawable.points_m) if isinstance(drawable, ShownCloud) else 0
-    count = len(drawable.indices) if isinstance(drawable, ShownVoxels) else count
-    if count > POINTS_MAX:
-        yield f"{slot} has {count} points; one in {_stride(count)} is shown"
+def _thinned(slot: Slot, drawable: Drawable | None, node: Node | None) -> Iterator[str]:
+    if isinstance(node, PointsNode) and node.one_in > 1:
+        yield f"{slot} has more than {POINTS_MAX} points; one in {node.one_in} is shown"
     if isinstance(drawable, ShownMesh) and len(drawable.triangles) > TRIANGLES_MAX:
         yield f"{slot} has {len(drawable.triangles)} triangles; {TRIANGLES_MAX} are shown"
 
