@@ -13,10 +13,11 @@ from enact_dist.view.activity import Activity
 from enact_dist.view.feed import Feed
 from enact_dist.view.pages.comparing import MARKED, NOW, Side
 from enact_dist.view.pages.contents import PageContents
-from enact_dist.view.pages.datum import Lineage, Samples
+from enact_dist.view.pages.datum import Lineage, Samples, recording_of
 from enact_dist.view.pages.viewer import Viewer, ViewSettings
 from enact_dist.view.recorded import RecordingFeed, RecordingSource
 from enact_dist.view.source import CellSource
+from enact_dist.wire.payload import decode_untyped
 
 POSE = Aspect("pose", np.ndarray, retention=Retention(versions=3))
 SPEED = Aspect("speed", float)
@@ -204,6 +205,17 @@ def test_locks_actors_and_shards_are_tables(cell, feed):
         assert activity.type_of("pose")
     finally:
         activity.stop()
+
+
+def test_a_moment_is_a_recording_that_can_be_shown(cell, tmp_path):
+    """What a page downloads opens again, with the data of that moment."""
+    before = move(cell, 1.0)
+    move(cell, 2.0)
+    name, content = recording_of(CellSource(cell), "online", before.stamp_ns, SHOWS)
+    (tmp_path / name).write_bytes(content)
+    source = RecordingSource(tmp_path / name)
+    data = source.data_at([SLOT], source.timeline.newest_ns).data
+    assert decode_untyped(data[SLOT].datum)[0, 3] == 1.0
 
 
 def test_a_recording_is_a_past(cell, tmp_path):
