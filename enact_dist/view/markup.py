@@ -46,8 +46,10 @@ def small(content: str) -> str:
     return f'<div style="{style}">{content}</div>'
 
 
-def table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, empty: str) -> str:
-    """Return a table, or the sentence `empty` without any row."""
+def table(
+    columns: Sequence[str], rows: Iterable[Sequence[object]], *, empty: str, count: int = 0
+) -> str:
+    """Return a table, or the sentence `empty` without any row; `count`: of all rows, if more."""
     lines_ = [
         "<tr>" + "".join(f'<td style="padding:1px 6px">{text(cell)}</td>' for cell in row) + "</tr>"
         for row in rows
@@ -57,7 +59,7 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, empty: st
     head = "".join(
         f'<th style="padding:1px 6px;text-align:left">{text(one)}</th>' for one in columns
     )
-    more = len(lines_) - ROWS_SHOWN_MAX
+    more = max(count, len(lines_)) - ROWS_SHOWN_MAX
     left = f"<div>… and {more} more</div>" if more > 0 else ""
     body = "".join(lines_[:ROWS_SHOWN_MAX])
     return small(f'<table style="border-collapse:collapse"><tr>{head}</tr>{body}</table>{left}')
