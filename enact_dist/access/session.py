@@ -22,7 +22,7 @@ from enact_dist.errors import (
 from enact_dist.link.client.calls import CALL_S
 from enact_dist.link.client.fetch import DatumCache
 from enact_dist.retention import checked_retention
-from enact_dist.terms import Access, Aspect, Entity, LockRequest, refuse_duplicates
+from enact_dist.terms import Access, Entity, LockRequest, refuse_duplicates
 from enact_dist.wire.fingerprint import fingerprint
 from enact_dist.wire.limits import ITEMS_MAX
 
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from enact_dist.core.client.plan import Reading
     from enact_dist.core.protocol.datum import Slot
     from enact_dist.link.client.locks import CellClient
+    from enact_dist.terms import Aspect
 
 
 SETTLE_S: Final = 10.0
@@ -310,13 +311,6 @@ class Session:
             self._entries[id(aspect)] = known
         _, writing, reading = known
         return reading if reads else writing
-
-    def untyped(self, name: str) -> Aspect[Any]:
-        """Return an aspect that the shards know, to write nothing but null with it."""
-        aspect = Aspect(name, object)
-        entry = self.client.aspect_entries()[name]
-        self._entries[id(aspect)] = (aspect, entry, entry._replace(reads=True))
-        return aspect
 
     def aspect_used(self, name: str) -> Aspect[Any] | None:
         """Return the aspect of that name that this process used last here, if it used one."""

@@ -90,6 +90,13 @@ def world_name(text: str) -> str:
     return text
 
 
+@in_words()
+def label(text: str) -> str:
+    """Check a label for pinned versions; an `argparse` type."""
+    checked_name("label", text, slashes=True)
+    return text
+
+
 def pair(text: str) -> tuple[str, str]:
     """Read ``name=value``; an `argparse` type."""
     name, equals, value = text.partition("=")

@@ -149,7 +149,7 @@ def tree_of(
     kind: type[Tree], session: Session, named: Named, version: int, depth: int | None
 ) -> Tree:
     """Return the causes or the effects of a version; see `Cell.why` and `Cell.impact`."""
-    search = _Search(session.client)
+    search = Search(session.client)
     root = search.start(_slot_of(session, *named), version)
     follow = search.causes if kind is CauseTree else search.effects
     return _grown(kind, search, root, follow, depth)
@@ -176,7 +176,7 @@ def _slot_of(
 
 def _grown(
     kind: type[Tree],
-    search: _Search,
+    search: Search,
     root: DatumRead,
     follow: Callable[[Sequence[DatumRead]], Mapping[DatumRead, Sequence[DatumRead]]],
     depth: int | None,
@@ -220,7 +220,7 @@ def _grown(
     return grown[root]
 
 
-class _Search:
+class Search:
     """What the shards know of versions, asked for step by step."""
 
     def __init__(self, client: CellClient) -> None:

@@ -1,12 +1,16 @@
 """Wrong versions that become null, with what was made of them."""
 
+import dataclasses
+import itertools
 import threading
 from dataclasses import dataclass
 
 import pytest
 
-from enact_dist import Aspect, Entity, Lock, Read, View, Write
-from enact_dist.errors import LockHeldError, LockTimeoutError, MisuseError, NullDatumError
+from enact_dist import Aspect, Entity, Lock, Read, View, Write, connect
+from enact_dist.actor.outcome import Outcome
+from enact_dist.errors import ForgottenError, LockTimeoutError, MisuseError, NullDatumError
+from enact_dist.wire.fingerprint import fingerprint
 from enact_dist.world import invalidation
 
 
@@ -124,30 +128,101 @@ def test_what_was_made_of_the_null_is_not_touched(cell, world, chain):
         assert lock[write] == -1
 
 
+def meanwhile(monkeypatch, act):
+    """Let something happen once between the search for effects and the lock; count the rounds."""
+    rounds, replaced = [], invalidation._replaced
+
+    def acting(client, shown, *, wait_s):
+        if not rounds:
+            act()
+        rounds.append(len(shown))
+        return replaced(client, shown, wait_s=wait_s)
+
+    monkeypatch.setattr(invalidation, "_replaced", acting)
+    return rounds
+
+
 def test_an_effect_that_comes_meanwhile_is_found(cell, world, chain, monkeypatch):
     """Who had viewed the pose before commits what it made of it while the pose becomes null."""
-    late, look = Write(world, CUP, OTHER), invalidation._replace
-    pose = View(world, CUP, POSE)
 
-    def replace(session, made, *, wait_s):
-        if not rounds:
-            with Lock(late, pose) as lock:
-                lock[late] = int(lock[pose].x_m)
-        rounds.append(len(made))
-        return look(session, made, wait_s=wait_s)
+    def commit_late():
+        late, pose = Write(world, CUP, OTHER), View(world, CUP, POSE)
+        with Lock(late, pose) as lock:
+            lock[late] = int(lock[pose].x_m)
 
-    rounds = []
-    monkeypatch.setattr(invalidation, "_replace", replace)
+    rounds = meanwhile(monkeypatch, commit_late)
     replaced = cell.invalidate("bad", chain)
 
     assert [one.slot.aspect for one in replaced][-1] == "other"
-    assert rounds == [3, 4, 4]
+    assert rounds == [3, 1]
 
 
-def test_slots_that_stay_locked_are_named(cell, world, chain):
-    """Nothing is replaced then."""
-    with Lock(Write(world, CUP, GRASP)), pytest.raises(LockHeldError):
-        cell.invalidate("bad", chain)
+def test_a_newer_datum_that_comes_meanwhile_stays(cell, world, chain, monkeypatch):
+    """The lock is granted after it."""
+    meanwhile(monkeypatch, lambda: put(world, CUP, POSE, Pose(9.0)))
+
+    replaced = cell.invalidate("bad", chain)
+
+    assert sorted(one.slot.aspect for one in replaced) == ["grasp", "scale"]
+    with Lock(pose := Read(world, CUP, POSE)) as lock:
+        assert lock[pose] == Pose(9.0)
+
+
+def test_an_outcome_stays_and_what_was_made_of_it_does_not(cell, world, chain):
+    """Without it an actor with `once` would act a second time."""
+    outcome = Aspect("pose_outcome", Outcome)
+    put(world, CUP, outcome, Outcome("done", 1, 1), (CUP, POSE))
+    put(world, CUP, OTHER, 1, (CUP, outcome))
+
+    replaced = cell.invalidate("bad", chain)
+
+    assert fingerprint(Outcome).startswith(invalidation.OUTCOME)
+    assert sorted(one.slot.aspect for one in replaced) == ["grasp", "other", "pose", "scale"]
+    with Lock(read := Read(world, CUP, outcome)) as lock:
+        assert lock[read].state == "done"
+
+
+def test_a_long_chain_is_followed_to_its_end(cell, world):
+    """Trees for people end after 200 steps."""
+    long = [Aspect(f"step_{number}", int) for number in range(230)]
+    wrong = put(world, CUP, long[0], 0)
+    for before, after in itertools.pairwise(long):
+        put(world, CUP, after, 1, (CUP, before))
+
+    assert len(cell.invalidate("bad", wrong)) == len(long)
+
+
+def test_more_slots_than_one_lock_takes_become_null_in_parts(cell, world, chain, monkeypatch):
+    """Each part in one commit."""
+    monkeypatch.setattr(invalidation, "ITEMS_MAX", 2)
+
+    assert len(cell.invalidate("bad", chain)) == 3
+    assert world.history(CUP, GRASP)[-1].null_reason == "deleted"
+
+
+@pytest.mark.carrier("socket")
+def test_an_observer_pins_nothing(cell, chain):
+    """It is refused before anything is done."""
+    with connect(cell.shards()[0].endpoint, observer=True) as other:
+        with pytest.raises(MisuseError, match="only observes"):
+            other.invalidate("bad", chain)
+        assert other.pinned() == {}
+
+
+def test_a_number_that_another_datum_has_now_is_refused(cell, chain):
+    """Versions of a volatile slot start again with its shard; the stamp tells them apart."""
+    earlier = dataclasses.replace(chain, position=chain.position._replace(stamp_ns=1))
+
+    with pytest.raises(ForgottenError, match="another datum now"):
+        cell.invalidate("bad", earlier)
+
+
+def test_a_null_is_refused_with_what_to_name(cell, world, chain):
+    """The second run of a command without a version finds the null that the first has written."""
+    cell.invalidate("bad", chain)
+
+    with pytest.raises(NullDatumError, match="that was wrong, as in camera/scale@1"):
+        cell.invalidate("bad", world.history(CAMERA, SCALE)[-1])
 
 
 def test_a_holder_is_waited_for(cell, world, chain):

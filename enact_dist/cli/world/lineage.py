@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.cli.arguments import READER, WORLD, counted, seconds_of, slot_version
+from enact_dist.cli.arguments import READER, WORLD, counted, label, seconds_of, slot_version
 from enact_dist.cli.target import open_cell
 from enact_dist.cli.verbs import NOUNS, Option, Output, Verb, flag, option
+from enact_dist.terms import NAME_LENGTH_MAX
 from enact_dist.world.trees import ALIKE_MIN, drawn, print_tree
 
 if TYPE_CHECKING:
@@ -32,7 +33,9 @@ def _options(what: str, *more: Option) -> tuple[Option, ...]:
     )  # fmt: skip
 
 
-_PIN: Final = option("--pin", "LABEL", "pin the versions of the tree until `enact world unpin`")
+_PIN: Final = option(
+    "--pin", "LABEL", "pin the versions of the tree until `enact world unpin`", type=label
+)
 VERBS: Final = (
     Verb(
         "why", NOUNS["why"].summary, "show_causes",
@@ -52,7 +55,7 @@ VERBS: Final = (
         (
             *_options("effects")[:2],
             option("--label", "LABEL", "pin all of it until `enact world unpin LABEL`",
-                   required=True),
+                   type=label, required=True),
             flag("--dry-run", "show the tree of effects, and change nothing"),
             seconds_of("--wait", "how long to wait for the lock (default: 10)", 10.0),
             *READER,
@@ -81,7 +84,8 @@ def invalidate_version(options: argparse.Namespace) -> Output:
     if options.dry_run:
         options.depth, options.all = None, False
         return show_effects(options)
-    with open_cell(options, observer=False, actor=f"invalidate/{options.label}") as cell:
+    actor = f"invalidate/{options.label}"[:NAME_LENGTH_MAX].rstrip("/")
+    with open_cell(options, observer=False, actor=actor) as cell:
         entity, aspect, version = options.slot
         wrong = cell.why(options.world, entity, aspect, version, depth=0)
         replaced = cell.invalidate(options.label, wrong, wait_s=options.wait)
