@@ -400,13 +400,14 @@ def masks_of(tree: CauseTree) -> list[CauseTree]:
 
 
 def recording(
-    cell: Cell, path: Path, *, gives_way: bool = True
+    cell: Cell, path: Path, *, aspects: Sequence[str] = RECORDED, gives_way: bool = True
 ) -> contextlib.AbstractContextManager[RecordingSummary]:
     """Record a cell exactly, without messages for viewers, while the block runs.
 
     Args:
         cell: The cell.
         path: The file; an older one is replaced.
+        aspects: Names of the aspects.
         gives_way: Record only as far as the cell leaves a processor idle.
 
     Raises:
@@ -414,5 +415,5 @@ def recording(
     """
     worlds = ONLINE, TRUTH
     return running_cell.recording(
-        cell, path, worlds=worlds, aspects=RECORDED, pictures=False, gives_way=gives_way
+        cell, path, worlds=worlds, aspects=aspects, pictures=False, gives_way=gives_way
     )

@@ -24,7 +24,7 @@ from actors.workcell.demo_cell import RunningCell
 from actors.workcell.demo_conduct import Conductor, recording
 from actors.workcell.demo_options import Options
 from actors.workcell.scenario_checks import checks_of
-from actors.workcell.trace import trace_of
+from actors.workcell.trace import RECORDED, trace_of
 from actors.workcell.truth_of_run import too_fast_of, truth_of
 from actors.workcell.watch import SILENT
 from enact_dist import Aspect, Entity, Lock, Write
@@ -50,6 +50,8 @@ LEAST_S = 8.0
 """How much of the scenario the truth of a run must cover to say anything."""
 EVERY_CAMERA = [words.camera_entity(number).name for number in range(words.CAMERA_COUNT)]
 LOOK_S = 0.01
+MOTION = tuple(set(RECORDED) - {"silhouette", "hull", "limbs", "prediction"})
+"""What the truth of a run needs: to record masks and hulls, too, a busy machine has no time."""
 
 
 class Trial:
@@ -190,7 +192,8 @@ def trial(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Trial]:
         Conductor(cell, processes, options, print).prepare()
         with contextlib.ExitStack() as recorded:
             path = out / "run.mcap"
-            summary = recorded.enter_context(recording(cell, path, gives_way=False))
+            recorder = recording(cell, path, aspects=MOTION, gives_way=False)
+            summary = recorded.enter_context(recorder)
             yield Trial(processes, cell, path, recorded, summary)
 
 
