@@ -21,10 +21,10 @@ sys.path.insert(0, str(Path(__file__).parent))
 import carriers
 import ports
 
-HALVED = [Path(__file__).parent / name for name in ("actors", "bench", "recording", "verify")]
+HALVED = [Path(__file__).parent / name for name in ("actors", "bench", "cli", "recording", "verify")]
 """Of the tests of applications and tools each run takes half of the files of a folder.
 
-Of the files with other slow tests it takes the slow ones of two in three.
+Of the files with other slow tests it takes the slow ones of every second.
 """
 
 # How long an example takes says more about the machine than about what is tested.
@@ -61,7 +61,7 @@ def pytest_collection_modifyitems(config, items):
         if mark is None and any(folder in item.path.parents for folder in HALVED):
             groups[item.path.parent, 1 / 2][item.path.name].append(item)
         elif mark is None and item.get_closest_marker("slow"):
-            groups["slow", 2 / 3][str(item.path)].append(item)
+            groups["slow", 1 / 2][str(item.path)].append(item)
         elif mark is not None:
             of, case = mark.kwargs.get("of", "test"), item.nodeid
             if of == "test":
