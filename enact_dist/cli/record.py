@@ -37,8 +37,10 @@ from enact_dist.world.trees import shown_s
 
 if TYPE_CHECKING:
     import argparse
+    from collections.abc import Iterable
 
     from enact_dist.access.arguments import When
+    from enact_dist.cli.verbs import Part
     from enact_dist.config.shows import Shows
     from enact_dist.recording import RecordingSummary, ReplaySummary
 
@@ -52,6 +54,18 @@ def world_choice(text: str) -> tuple[str, str]:
 
 
 _SUMMARY: Final = (flag("--json", "print the summary as JSON"), TIMEOUT)
+
+_OF_A_FILE: Final = (
+    option("--speed", "S", "0: as fast as possible (default: 1)", type=float),
+    ENTITIES,
+    ASPECTS,
+    option("--from", "T",
+           "begin with the state as of T, seconds since the recording's begin, or "
+           + MOMENT_HELP, dest="begin", type=moment),
+    option("--to", "T", "end at T, likewise", dest="end", type=moment),
+    flag("--loop", "start again at the end, until Ctrl-C"),
+    flag("--overwrite", "also write into contexts that have data"),
+)  # fmt: skip
 
 _STEP: Final = OptionGroup(
     "one step of an actor",
@@ -116,18 +130,10 @@ VERBS: Final = (
                 "metavar": "CELL", "dest": "cell",
                 "help": "a cell.toml or an endpoint (default: $ENACT_CELL, else ./cell.toml)",
             }),
-            option("--speed", "S", "0: as fast as possible (default: 1)", type=float, default=1.0),
             many("--world", "NAME|OLD=NEW",
                  "replay only this context (repeat it for several); OLD=NEW writes the recorded"
                  " data of OLD into NEW", type=world_choice),
-            ENTITIES,
-            ASPECTS,
-            option("--from", "T",
-                   "begin with the state as of T, seconds since the recording's begin, or "
-                   + MOMENT_HELP, dest="begin", type=moment),
-            option("--to", "T", "end at T, likewise", dest="end", type=moment),
-            flag("--loop", "start again at the end, until Ctrl-C"),
-            flag("--overwrite", "also write into contexts that have data"),
+            *_OF_A_FILE,
             *_SUMMARY,
             _STEP,
         ),
@@ -208,11 +214,15 @@ def run_replay(options: argparse.Namespace) -> int:
     """Commit a recording again until its end or a signal; fail where nothing in it was chosen.
 
     Raises:
-        ConfigError: Neither a recording nor a step is named, or both.
+        ConfigError: Neither a recording nor a step is named, or both, or an option of the other.
     """
     if (options.file is None) == (options.step is None):
         raise ConfigError("name either a recording or --step WORLD ENTITY/ASPECT@VERSION")
-    if options.step is not None:
+    of_a_step = options.step is not None
+    if unused := _given(options, _OF_A_FILE if of_a_step else _STEP.options):
+        what = "a recording, not of --step" if of_a_step else "--step, not of a recording"
+        raise ConfigError(f"options of {what}: {', '.join(unused)}")
+    if of_a_step:
         from enact_dist.cli.step import run_step
 
         return run_step(options)
@@ -232,7 +242,7 @@ def run_replay(options: argparse.Namespace) -> int:
             only_worlds=worlds if any(old == new for old, new in worlds.items()) else (),
             entities=options.entities,
             aspects=options.aspect or (),
-            speed=options.speed,
+            speed=1.0 if options.speed is None else options.speed,
             overwrite=options.overwrite,
         )
         begin_ns = int(replay.recording.facts.get("begin_ns", "0"))
@@ -255,6 +265,18 @@ def run_replay(options: argparse.Namespace) -> int:
         print("enact: no recorded data match the options, so nothing was set", file=sys.stderr)
         return FAILED
     return DONE
+
+
+def _given(options: argparse.Namespace, among: Iterable[Part]) -> list[str]:
+    """Return which of some options the command line has: those that are not as without it."""
+    found = []
+    for one in among:
+        if isinstance(one, Option):  # no `OneOf` is among them
+            name = one.settings.get("dest", one.names[0][2:].replace("-", "_"))
+            value = getattr(options, name)
+            if value is not None and value is not False and value != one.settings.get("default"):
+                found.append(one.names[0])
+    return found
 
 
 def _moment_ns(when: When | None, begin_ns: int) -> int:

@@ -2,7 +2,8 @@
 
 A datum is read by a view as of its timestamp: shards show what is retained, and what was replaced
 within the last 2 s.  As of the largest timestamp of a batch each slot shows its newest version of
-the batch, so a batch takes as many views as the busiest slot has versions in it.
+the batch, so a batch takes as many views as the busiest slot has versions in it, and more if it has
+more slots than one view may ask for.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from enact_dist.access.writes import Writing
 from enact_dist.core.protocol.messages import Item, SlotVersion
 from enact_dist.errors import ForgottenError, LeaseLostError
 from enact_dist.terms import Access
+from enact_dist.wire.limits import ITEMS_MAX
 from enact_dist.wire.payload import Encoded
 
 if TYPE_CHECKING:
@@ -87,7 +89,8 @@ def found_of(session: Session, wanted: Sequence[Wanted]) -> dict[Wanted, Retaine
     while by_slot:
         newest = [versions.pop() for versions in by_slot.values()]
         by_slot = {slot: versions for slot, versions in by_slot.items() if versions}
-        found |= _together(session, newest)
+        for at in range(0, len(newest), ITEMS_MAX):
+            found |= _together(session, newest[at : at + ITEMS_MAX])
     return found
 
 

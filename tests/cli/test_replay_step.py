@@ -140,6 +140,30 @@ def test_neither_a_recording_nor_a_step_is_wrong_usage(enact):
     assert enact("replay").status == 2
 
 
+@pytest.mark.parametrize(
+    "words",
+    ["--speed 0", "--entities x", "--aspect x", "--from 1", "--to 2", "--loop", "--overwrite"],
+)
+def test_option_of_a_recording_is_refused_with_a_step(replay, words):
+    """It would change nothing."""
+    found = replay("--name", "scale", *words.split())
+
+    assert found.status == 2
+    assert f"options of a recording, not of --step: {words.split()[0]}" in found.err
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["--actor m:C", "--name n", "--option a=1", "--entity e", "--tolerance 1", "--keep-as k"],
+)
+def test_option_of_a_step_is_refused_with_a_recording(enact, words):
+    """Before the recording is opened."""
+    found = enact("replay", "run.mcap", *words.split())
+
+    assert found.status == 2
+    assert f"options of --step, not of a recording: {words.split()[0]}" in found.err
+
+
 def test_view_of_the_step_has_its_data_at_once(weighed):
     """A step that is kept is a world context like any other."""
     from weighing import Weigh

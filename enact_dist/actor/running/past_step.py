@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.access.asking import ask_all, explained
 from enact_dist.access.reads import slot_of
 from enact_dist.actor.actor import narrowed, stands_for_trigger
+from enact_dist.actor.triggers import tick_before
 from enact_dist.core.protocol.datum import Slot
 from enact_dist.core.protocol.messages import ListHistory, SlotVersion, Versions
 from enact_dist.errors import ForgottenError, MisuseError
@@ -33,26 +34,12 @@ NAMED_MAX: Final = 4
 
 
 class PastStep:
-    """The step that made a version.
-
-    Args:
-        cell: The cell.
-        world: Name of the version's world context.
-        entity: Name of its entity.
-        aspect: Name of its aspect.
-        version: Its number; 0: the newest.
+    """The step that made a version; arguments and errors are those of `Step`.
 
     Attributes:
         made: The version and what its commit had read, one step deep.
         name: The version, as ``world:entity/aspect vN``.
         session: The connection that asks.
-
-    Raises:
-        NullDatumError: Nothing was ever set there.
-        ForgottenError: The version itself is beyond retention.
-        MisuseError: There is no such version yet, or it is not known which commit made it.
-        UnknownWorldError: The cell has no world context of that name.
-        ShardUnreachableError: A shard does not answer.
     """
 
     def __init__(self, cell: Cell, world: str, entity: str, aspect: str, version: int = 0) -> None:
@@ -183,8 +170,26 @@ class PastStep:
         if self.made.left_out:
             yield f"the commit read {self.made.left_out} more data than it names"
 
-    def written(self, bound: BoundActor, history: Mapping[Slot, list[VersionEntry]]) -> set[Slot]:
-        """Return what the commit wrote in the world contexts of the actor, as far as known."""
+    def tick_ns(self, every_s: float, *, in_phase: bool) -> int:
+        """Return the tick of a source: the version's capture stamp if it may be one.
+
+        A source may also put a stamp of its own, as the time of an exposure.  Then it is the newest
+        tick before the commit.
+        """
+        captured_ns = self.made.stamp_ns
+        if 0 < captured_ns <= self._at_ns and (
+            not in_phase or tick_before(captured_ns, every_s) == captured_ns
+        ):
+            return captured_ns
+        return tick_before(self._at_ns, every_s)
+
+    def written(
+        self, bound: BoundActor, history: Mapping[Slot, list[VersionEntry]]
+    ) -> tuple[set[Slot], tuple[str, ...]]:
+        """Return what the commit wrote in the world contexts of the actor, as far as known.
+
+        Also a remark on what it wrote in others.
+        """
         contexts = {context.name for context in bound.contexts.values()}
         slots = {version.slot for version in self._cause.writes}
         slots |= {
@@ -193,7 +198,13 @@ class PastStep:
             for entry in entries
             if entry.cause is not None and entry.cause.lock == self._cause.lock
         }
-        return {slot for slot in slots | {self.made.slot} if slot.context in contexts}
+        others = [str(slot) for slot in slots if slot.context not in contexts]
+        remark = (
+            f"written by the commit, and not compared: {some(others)}, because this actor is not"
+            " bound to that world context"
+        )
+        slots = {slot for slot in slots | {self.made.slot} if slot.context in contexts}
+        return slots, (remark,) if others else ()
 
     def forgotten_since(self, slots: list[Slot]) -> set[Slot]:
         """Return the slots of one context whose version after the commit is not known any more."""

@@ -20,20 +20,20 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
+from enact_dist.access.arguments import checked_as
 from enact_dist.access.lock import refuse_inside_lock
 from enact_dist.actor.binding import BoundActor
-from enact_dist.actor.running.doing import own_lines, raised
+from enact_dist.actor.running.doing import Doing, own_lines, raised
 from enact_dist.actor.running.past_step import PastStep, members_of, some
-from enact_dist.actor.triggers import tick_before
 from enact_dist.compare.diff import Diff, diff_places
 from enact_dist.core.protocol.datum import Slot
-from enact_dist.errors import EnactError, MisuseError
-from enact_dist.terms import Aspect, Entity, checked_name
+from enact_dist.errors import EnactError, LinkError, MisuseError, UnknownWorldError
+from enact_dist.terms import Aspect, Entity
 from enact_dist.wire.limits import BODY_BYTES_MAX, ITEMS_MAX
 from enact_dist.world.version_data import set_encoded
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Iterator, Mapping, Sequence
 
     from enact_dist.actor.actor import Actor
     from enact_dist.core.protocol.datum import Datum
@@ -57,7 +57,8 @@ class StepResult:
         inputs: How many data the step was given.
         differences: By world context: how what the commit wrote (left) and what the step wrote
             (right) differ.
-        error: What `update` raised, and where; empty if it did not.
+        error: What `update` raised, and where, and then `stop`, if it also did; empty if `update`
+            did not.
         traceback: Its lines of the user's own files.
         remarks: What may make the step another one than it was.
     """
@@ -142,7 +143,8 @@ class Step:
         entity = past.entity(bound)
         history = past.history(bound, entity)
         inputs, remarks = past.inputs(bound, entity, history)
-        then = past.written(bound, history)
+        then, left_out = past.written(bound, history)
+        remarks += left_out
         names = self._names(bound, keep_as)
         result = StepResult(
             past.name,
@@ -154,14 +156,15 @@ class Step:
             len(inputs),
             remarks=remarks,
         )
-        with self._contexts(names, keep=bool(keep_as)):
+        with self._contexts(list(names.values()), keep=bool(keep_as)):
             self._set(names, inputs)
             before = self._versions(names)
             roles = {role: names[context.name] for role, context in bound.contexts.items()}
             again = BoundActor(actor, self._cell, roles)
             failed = self._update(again, entity, members_of(bound, inputs))
             if failed is not None:
-                return replace(result, error=raised(failed), traceback=tuple(own_lines(failed)))
+                error = "; ".join((raised(failed), *getattr(failed, "__notes__", ())))
+                return replace(result, error=error, traceback=tuple(own_lines(failed)))
             after = self._versions(names)
             now = {slot for slot, state in after.items() if before.get(slot) != state}
             types = {one.aspect.name: one.aspect for one in bound.declaration.requests.values()}
@@ -172,40 +175,66 @@ class Step:
     def _names(self, bound: BoundActor, keep_as: str) -> dict[str, str]:
         """Return what the step's world contexts are called, by those that they stand for."""
         worlds = list(dict.fromkeys(context.name for context in bound.contexts.values()))
-        base = keep_as or f"step-{secrets.token_hex(4)}"
+        base = keep_as or _own_name()
         names = {world: base if len(worlds) == 1 else f"{base}-{world}" for world in worlds}
-        there = self._cell.worlds()
-        for name in names.values():
-            try:
-                checked_name("world context", name, slashes=False)
-            except ValueError as error:
-                raise MisuseError(str(error)) from None
-            if name in there:
-                raise MisuseError(
-                    f"there is a world context {name!r}; take another name, or drop it: enact world"
-                    f" drop {name}"
-                )
+        if keep_as:
+            there = self._cell.worlds()
+            for name in names.values():
+                if checked_as("world context", name) in there:
+                    raise MisuseError(
+                        f"there is a world context {name!r}; take another name, or drop it: enact"
+                        f" world drop {name}"
+                    )
         return names
 
     @contextmanager
-    def _contexts(self, names: Mapping[str, str], *, keep: bool) -> Iterator[None]:
-        """Make the step's world contexts; drop them at the end unless they are to be kept."""
+    def _contexts(self, names: Sequence[str], *, keep: bool) -> Iterator[None]:
+        """Make the step's world contexts; drop them at the end unless they are to be kept.
+
+        A name that a user chose may be taken at any moment, and `create_world` returns what is
+        there.  A fork never does so: where it is made, the name was free on every shard.
+        """
         made: list[str] = []
         try:
-            for name in names.values():
-                made.append(name)
-                self._cell.create_world(name)
+            if keep:
+                made.append(_own_name())
+                empty = self._cell.create_world(made[0])
+                for name in names:
+                    empty.fork(name)
+                    made.append(name)
+                self._drop([made.pop(0)])
+            else:
+                for name in names:  # of these nobody else knows
+                    made.append(name)
+                    self._cell.create_world(name)
             yield
-        except BaseException:
-            self._drop(made)
+        except BaseException as error:
+            try:
+                self._drop(made)
+            except EnactError as left:
+                error.add_note(str(left))
             raise
         if not keep:
             self._drop(made)
 
-    def _drop(self, names: Iterable[str]) -> None:
+    def _drop(self, names: Sequence[str]) -> None:
+        """Drop world contexts that this step has made; those that are gone are no error.
+
+        Raises:
+            EnactError: Some are still there; names them, and how to drop them.
+        """
+        left: dict[str, EnactError] = {}
         for name in names:
-            if name in self._cell.worlds():
+            try:
                 self._cell.drop_world(name)
+            except UnknownWorldError:
+                pass
+            except EnactError as error:
+                left[name] = error
+        if left:
+            todo = ", ".join(f"enact world drop {name}" for name in left)
+            why = next(iter(left.values()))
+            raise LinkError(f"this step's world contexts are to be dropped by hand ({todo}): {why}")
 
     def _set(self, names: Mapping[str, str], inputs: Mapping[Slot, Datum]) -> None:
         client = self._session.client
@@ -238,12 +267,11 @@ class Step:
         self, bound: BoundActor, entity: Entity | None, members: tuple[int, ...]
     ) -> BaseException | None:
         """Run the update in the step's contexts; return what it raised."""
-        actor, failed = bound.actor, None
-        every_s, tick_ns = actor.every_s, 0
-        if every_s and not bound.declaration.triggers:
-            tick_ns = self._past.made.stamp_ns or tick_before(
-                self._past.made.position.stamp_ns, every_s
-            )
+        actor = bound.actor
+        failed: BaseException | None = None
+        tick_ns = 0
+        if actor.every_s and not bound.declaration.triggers:
+            tick_ns = self._past.tick_ns(actor.every_s, in_phase=actor.in_phase)
         _called(actor, "start")
         try:
             with bound.lock(entity, tick_ns=tick_ns, members=members) as lock:
@@ -252,10 +280,14 @@ class Step:
                 except (Exception, SystemExit) as error:
                     failed = error
                     raise
-        except (Exception, SystemExit):
-            if failed is None:
+        except BaseException as error:
+            try:
+                _called(actor, "stop")
+            except EnactError as late:
+                (failed or error).add_note(str(late))
+            if failed is None or not isinstance(error, (Exception, SystemExit)):
                 raise
-        finally:
+        else:
             _called(actor, "stop")
         return failed
 
@@ -281,16 +313,21 @@ class Step:
         return tuple(found), (remark,) if forgotten else ()
 
 
+def _own_name() -> str:
+    return f"step-{secrets.token_hex(4)}"
+
+
 def _called(actor: Actor, method: str) -> None:
     """Call `start` or `stop` of an actor.
 
     Raises:
-        MisuseError: It raised something of its own.
+        MisuseError: It raised something of its own, or called `sys.exit`.
     """
+    name = type(actor).__name__
     try:
-        getattr(actor, method)()
+        with Doing(name).inside(method):
+            getattr(actor, method)()
     except EnactError:
         raise
     except Exception as error:
-        name = type(actor).__name__
         raise MisuseError(f"{method} of actor {name} failed: {raised(error)}") from error
