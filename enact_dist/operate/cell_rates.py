@@ -82,7 +82,9 @@ class Looks:
         self._last: Look | None = None
         self._slots: Mapping[Slot, SlotInfo] = {}
         self._slots_of: dict[str, ShardInfo] = {}
-        self._written = _Written({})
+        self._written = _Written(())
+        self._slots_unix_s = 0.0
+        self._unlisted: Mapping[str, str] = {}
         self._rows: tuple[DatumRates, ...] = ()
         self._shards: dict[str, ShardInfo] = {}
         self._first: dict[str, tuple[int, Mapping[str, int]]] = {}
@@ -111,6 +113,7 @@ class Looks:
             tuple(self._actors(look)),
             look.locks,
             self._rows,
+            self._slots_unix_s,
             tuple(self._events),
         )
         self._shards.update({shard.name: shard for shard in look.shards if shard.reachable})
@@ -141,10 +144,31 @@ class Looks:
         """Compare the slots with those of the look before that asked for them, if this one did."""
         if look.slots is None:
             return
-        shards = {shard.name: shard for shard in look.shards if shard.reachable}
-        spans_s = {name: _span_s(self._slots_of.get(name), one) for name, one in shards.items()}
-        self._rows = tuple(self._data(look, look.slots, spans_s))
-        self._slots, self._written = look.slots, _Written(look.slots)
+        for name, why in look.unlisted.items():
+            if name not in self._unlisted:
+                text = f"shard {name} does not list its slots, so the last known are shown: {why}"
+                self._events.append((look.unix_s, text))
+        self._unlisted = look.unlisted
+        shards = {
+            shard.name: shard
+            for shard in look.shards
+            if shard.reachable and shard.name not in look.unlisted
+        }
+        before = self._slots_of
+        spans_s = {  # a restarted shard goes on with its old versions, made before its uptime
+            name: _span_s(before[name], one)
+            for name, one in shards.items()
+            if name in before and before[name].epoch == one.epoch
+        }
+        kept = {
+            slot: info
+            for slot, info in self._slots.items()
+            if info.shard in look.unlisted and slot not in look.slots
+        }
+        rows = [one for one in self._rows if (one.world, one.entity, one.aspect) in kept]
+        self._rows = (*rows, *self._data(look, look.slots, spans_s))
+        self._slots = {**kept, **look.slots}
+        self._written, self._slots_unix_s = _Written(self._rows), look.unix_s
         self._slots_of.update(shards)
 
     def _note_actors(self, look: Look) -> None:
@@ -236,7 +260,7 @@ class Looks:
                     name,
                     state="silent" if info.silent else str(report.get("state", "")),
                     runs_hz=None if info.silent else _number(report, "rate_hz"),
-                    wrote_age_s=self._written.age_s(report.get("writes"), look.unix_s),
+                    wrote_age_s=self._written.age_s(report.get("writes")),
                     restarts=self._restarts.get(name, 0),
                     last_error=str(report.get("last_error", "")),
                     **_figures(report),
@@ -306,23 +330,21 @@ def _largest(reports: Iterable[Mapping[str, Any]], name: str) -> float:
 class _Written:
     """The newest commit of each aspect's slots, found by what an actor declares to write."""
 
-    def __init__(self, slots: Mapping[Slot, SlotInfo]) -> None:
-        self._stamps_ns: dict[tuple[str, str], dict[str, int]] = {}
-        for slot, info in slots.items():
-            if not info.null_reason:
-                stamps_ns = self._stamps_ns.setdefault((slot.context, slot.aspect), {})
-                stamps_ns[slot.entity] = info.position.stamp_ns
+    def __init__(self, rows: Iterable[DatumRates]) -> None:
+        self._ages_s: dict[tuple[str, str], dict[str, float]] = {}
+        for row in rows:
+            if not row.null_reason:
+                self._ages_s.setdefault((row.world, row.aspect), {})[row.entity] = row.age_s
 
-    def age_s(self, writes: object, unix_s: float) -> float | None:
+    def age_s(self, writes: object) -> float | None:
         """Return the age of the newest datum of ``world:entities/aspect``; None: of none."""
-        newest_ns = 0
+        found: list[float] = []
         for text in writes if isinstance(writes, (list, tuple)) else ():
             world, _, slot = str(text).partition(":")
             pattern, _, aspect = slot.rpartition("/")
-            stamps_ns = self._stamps_ns.get((world, aspect), {})
-            if "*" not in pattern:
-                newest_ns = max(newest_ns, stamps_ns.get(pattern, 0))
-                continue
-            found = (ns for entity, ns in stamps_ns.items() if pattern_matches(pattern, entity))
-            newest_ns = max(newest_ns, *found, 0)
-        return max(0.0, unix_s - newest_ns / 1e9) if newest_ns else None
+            ages_s = self._ages_s.get((world, aspect), {})
+            if "*" in pattern:
+                found += (s for entity, s in ages_s.items() if pattern_matches(pattern, entity))
+            elif pattern in ages_s:
+                found.append(ages_s[pattern])
+        return min(found, default=None)

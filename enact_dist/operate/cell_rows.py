@@ -101,7 +101,8 @@ class ActorRates:
         update_p50_ms: Median of its newest 512 updates, the wait for the lock left out.
         update_p99_ms: 99th percentile of the same.
         lock_wait_p99_ms: 99th percentile of its newest 512 waits for a lock.
-        wrote_age_s: Age of the newest datum that it may write; None: there is none.
+        wrote_age_s: Age of the newest datum that it may write, at the newest look at slots; None:
+            there is none.
         updates: Updates that committed.
         missed: Ticks of a source that never ran.
         incomplete: Sets of data that never ran.
@@ -145,7 +146,7 @@ class DatumRates:
         hz: Versions per second; None before there are two looks at it.
         size_bytes: Size of the newest datum's body.
         bytes_s: Bytes per second, if all its versions are of that size; None as `hz`.
-        age_s: Time since the newest commit.
+        age_s: Time from the newest commit to the look that showed it.
         null_reason: Why it is null; empty if it is not.
         shard: The shard that stores it.
     """
@@ -174,7 +175,9 @@ class CellRates:
         counters: The counters that have moved, those with a remedy first.
         actors: The actors, by name.
         locks: Locks held, awaited and kept.
-        data: The slots, as of the newest look that asked for them.
+        data: The slots, as of the newest look that asked for them; those of a shard that did not
+            list them then as of the one before.
+        data_unix_s: When that look was taken; 0: none asked for them.
         events: What happened to shards and actors since the first look: when (seconds since 1970),
             and what.
     """
@@ -187,6 +190,7 @@ class CellRates:
     actors: tuple[ActorRates, ...]
     locks: tuple[LockInfo, ...]
     data: tuple[DatumRates, ...]
+    data_unix_s: float
     events: tuple[tuple[float, str], ...]
 
     @property

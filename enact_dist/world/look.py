@@ -53,6 +53,7 @@ class Look:
         actors: The sessions of named actors, this process's own left out.
         locks: All locks held or awaited, the oldest first within each shard.
         slots: The newest version of each slot, null ones too; None: they were not looked at.
+        unlisted: Shards that answered, but did not list their slots, and why.
         slots_took_s: How long these took.
     """
 
@@ -62,6 +63,7 @@ class Look:
     actors: tuple[ActorInfo, ...] = ()
     locks: tuple[LockInfo, ...] = ()
     slots: Mapping[Slot, SlotInfo] | None = field(default_factory=dict)
+    unlisted: Mapping[str, str] = field(default_factory=dict)
     slots_took_s: float = 0.0
 
 
@@ -100,14 +102,19 @@ def look_at(client: CellClient, slots: Survey | None) -> Look:
 def _with_slots(client: CellClient, look: Look, survey: Survey, shards: Sequence[str]) -> Look:
     """Add the slots of the shards that have answered."""
     started_s = time.monotonic()
-    answers = _answers(client, [(shard, survey) for shard in shards], {})
-    slots = {
-        state.slot: slot_info(shard, state)
+    problems: dict[str, str] = {}
+    answers = _answers(client, [(shard, survey) for shard in shards], problems)
+    listed = {
+        shard: answer.states
         for shard, answer in zip(shards, answers, strict=True)
         if isinstance(answer, Surveyed)
-        for state in answer.states
     }
-    return replace(look, slots=slots, slots_took_s=time.monotonic() - started_s)
+    return replace(
+        look,
+        slots={s.slot: slot_info(shard, s) for shard, states in listed.items() for s in states},
+        unlisted={one: problems.get(one, "no answer") for one in shards if one not in listed},
+        slots_took_s=time.monotonic() - started_s,
+    )
 
 
 def _answers(

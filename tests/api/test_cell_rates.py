@@ -2,8 +2,12 @@
 
 import pytest
 
+from enact_dist import local
 from enact_dist.access.snapshot import SlotInfo
+from enact_dist.cli.top.tables import TABLES
 from enact_dist.core.protocol.datum import Position, Slot
+from enact_dist.core.protocol.messages import Survey
+from enact_dist.errors import LinkError
 from enact_dist.operate.cell_rates import LEASE_NAMES, CellLooks, Looks, pause_s
 from enact_dist.terms import Entity
 from enact_dist.world.listings import ActorInfo, LockInfo, ShardInfo
@@ -29,12 +33,12 @@ def actor(name="camera", session="s1", *, left_s=0.9, shards=("left",), namesake
     )  # fmt: skip
 
 
-def slots(**versions):
+def slots(where="left", **versions):
     """Slots of online:camera/NAME/image, each 0.5 s old at `T0_S`."""
     return {
         Slot("online", f"camera/{name}", "image"): SlotInfo(
-            Entity(f"camera/{name}"), "image", version, Position(int((T0_S - 0.5) * 1e9), "left"),
-            1_000, "", "left",
+            Entity(f"camera/{name}"), "image", version, Position(int((T0_S - 0.5) * 1e9), where),
+            1_000, "", where,
         )
         for name, version in versions.items()
     }  # fmt: skip
@@ -203,6 +207,75 @@ def test_look_without_slots_keeps_the_rates_of_the_last_one_with_them():
     assert [(one.version, one.hz) for one in without.data] == [(12, 2.0)]
     assert without.actors[0].wrote_age_s == pytest.approx(0.5)
     assert [(one.version, one.hz) for one in then.data] == [(32, 4.0)]
+
+
+def test_versions_before_a_restart_are_no_rate_of_the_time_since():
+    """A shard goes on with its version numbers, but its uptime begins again."""
+    looks = Looks()
+    looks.add(Look(T0_S, shards=(shard(uptime_s=900.0),), slots=slots(a=10)))
+    restarted = shard(uptime_s=0.5, epoch=2)
+    first = looks.add(Look(T0_S + 100, shards=(restarted,), slots=slots(a=510)))
+    second = shard(uptime_s=2.5, epoch=2)
+    then = looks.add(Look(T0_S + 102, shards=(second,), slots=slots(a=530)))
+
+    assert [one.hz for one in first.data] == [None]
+    assert [one.hz for one in then.data] == [10.0]
+
+
+def test_ages_of_data_are_those_at_the_look_that_showed_them():
+    """Between two looks at slots a busy actor does not seem to stand still; titles say when."""
+    looks, writer = Looks(), actor(writes=["online:camera/a/image"])
+    here = (shard(uptime_s=1.0),)
+    now = looks.add(Look(T0_S, shards=here, actors=(writer,), slots=slots(a=10)))
+    later = looks.add(Look(T0_S + 30.0, shards=here, actors=(writer,), slots=None))
+    actors, data = (one for one in TABLES if one.key in "ad")
+
+    assert later.data_unix_s == T0_S
+    assert later.actors[0].wrote_age_s == later.data[0].age_s == pytest.approx(0.5)
+    assert (actors.as_of(now), data.as_of(now)) == ("", "")
+    assert actors.as_of(later).startswith(", wrote as of ")
+    assert data.as_of(later).startswith(", all as of ")
+
+
+def test_slots_that_a_shard_does_not_list_stay_as_they_were():
+    """It is told once; when it lists them again, the rate is that of all the time between."""
+    looks, writer = Looks(), actor(writes=["online:camera/a/image"])
+
+    def look(after_s, listed, **unlisted):
+        both = tuple(shard(name, uptime_s=1.0 + after_s) for name in ("left", "right"))
+        return looks.add(
+            Look(T0_S + after_s, shards=both, actors=(writer,), slots=listed, unlisted=unlisted)
+        )
+
+    look(0.0, slots(a=10) | slots("right", b=5))
+    for after_s in (1.0, 2.0):
+        cut = look(after_s, slots("right", b=5), left="no answer")
+    back = look(4.0, slots(a=30) | slots("right", b=5))
+
+    assert {(one.entity, one.version) for one in cut.data} == {("camera/a", 10), ("camera/b", 5)}
+    assert cut.actors[0].wrote_age_s == pytest.approx(0.5)
+    text = "shard left does not list its slots, so the last known are shown: no answer"
+    assert cut.events == back.events == ((T0_S + 1.0, text),)
+    assert [(one.entity, one.hz) for one in back.data] == [("camera/a", 5.0), ("camera/b", 0.0)]
+
+
+def test_look_names_a_shard_that_does_not_list_its_slots(monkeypatch):
+    """It has answered all else, so it is not away."""
+    with local(worlds=["online"]) as cell:
+        client = type(cell.world("online").session.client)
+        call = client.call_once
+
+        def cut(self, calls, **options):
+            if any(isinstance(request, Survey) for _, request in calls):
+                raise LinkError("cut off")
+            return call(self, calls, **options)
+
+        monkeypatch.setattr(client, "call_once", cut)
+        look = cell.look(Survey((), ("**",), ()))
+
+    assert look.unlisted == {"local": "cut off"}
+    assert look.shards[0].reachable
+    assert look.slots == {}
 
 
 def test_slots_of_a_large_cell_are_looked_at_less_often():

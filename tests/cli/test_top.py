@@ -10,6 +10,7 @@ import sys
 import termios
 import time
 from contextlib import asynccontextmanager
+from dataclasses import replace
 
 import pytest
 
@@ -188,6 +189,15 @@ async def test_shard_that_is_away_is_told_until_it_is_back(screen):
     assert "shard left is back after 4.0 s" in screen.text("events")
 
 
+@on_screen
+async def test_title_says_when_slots_were_looked_at(screen):
+    """Where that was not now."""
+    await screen.show(look())
+    assert screen.app._panel(TABLES[3]).border_title == "data: 0"
+    await screen.show(replace(look(5), slots=None))
+    assert screen.app._panel(TABLES[3]).border_title.startswith("data: 0, all as of ")
+
+
 def test_error_of_a_look_ends_the_screen_and_is_raised_by_its_caller():
     """It is told as the error of the command, not as a traceback of a thread."""
 
@@ -199,6 +209,22 @@ def test_error_of_a_look_ends_the_screen_and_is_raised_by_its_caller():
                 screen.app.checked()
 
     asyncio.run(inside())
+
+
+def test_screen_that_is_to_end_before_it_runs_ends():
+    """A signal may come while the cell is opened; any thread may say so, and does not wait."""
+    from enact_dist.cli.top.screen import TopApp
+
+    asked = []
+    app = TopApp("mine", lambda: asked.append(1), every_s=1.0)
+    app.end()
+
+    async def inside():
+        async with app.run_test() as pilot:
+            await Screen(pilot, None, asked).until(lambda: not app.is_running)
+
+    asyncio.run(inside())
+    assert (asked, app.checked()) == ([], None)
 
 
 def test_many_rows_are_counted_beyond_those_that_are_shown(monkeypatch):
@@ -263,6 +289,15 @@ def test_once_as_json_has_what_the_tables_have(enact, cell_file):
     assert found["seconds"] > 0.1
     assert enact("top", "--world", "training", "--once", "--json", "--every", "0.1",
                  "--cell", cell_file).json["data"] == []  # fmt: skip
+
+
+def test_world_context_that_the_cell_does_not_have_is_refused(enact, cell_file):
+    """It is not shown as one without data."""
+    found = enact("top", "--once", "--world", "onlin", "--cell", cell_file)
+
+    assert found.status == 1
+    assert "'onlin'" in found.err
+    assert found.out == ""
 
 
 def test_looking_leaves_nothing_behind_at_the_shards(cell_file):

@@ -204,7 +204,7 @@ class Step:
                     made.append(name)
                 self._drop([made.pop(0)])
             else:
-                for name in names:  # of these nobody else knows
+                for name in names:  # no one else knows these
                     made.append(name)
                     self._cell.create_world(name)
             yield

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from contextlib import suppress
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Final
 
@@ -11,7 +12,7 @@ from enact_dist.cli.target import open_cell
 from enact_dist.cli.text.output import print_json, print_table
 from enact_dist.cli.top.tables import TABLES, headline
 from enact_dist.cli.verbs import DONE, UNREACHABLE
-from enact_dist.errors import ConfigError
+from enact_dist.errors import ConfigError, ShardUnreachableError
 from enact_dist.link.signals import StopSignals
 from enact_dist.operate.cell_rates import CellLooks, pause_s
 
@@ -30,6 +31,7 @@ def run_top(options: argparse.Namespace) -> int:
 
     Raises:
         ConfigError: The screen needs a package that is not installed.
+        UnknownWorldError: `--world` names a world context that the cell does not have.
     """
     on_screen = not options.once and not options.json and sys.stdout.isatty()
     on_screen = on_screen and sys.stdin.isatty()
@@ -39,6 +41,9 @@ def run_top(options: argparse.Namespace) -> int:
             " (pip install -e '.[view]' in the clone of enact-dist); enact top --once needs it not"
         )
     with StopSignals() as stop, open_cell(options) as cell:
+        with suppress(ShardUnreachableError):  # which the tables show
+            for name in options.world or ():
+                cell.world(name)
         looks = CellLooks(cell, options.entities, options.world or ())
         if on_screen:
             from enact_dist.cli.top.screen import TopApp

@@ -69,6 +69,9 @@ class TopApp(App[None]):
             super().__init__()
             self.rates = rates
 
+    class Ended(Message):
+        """The screen is to end."""
+
     class Failed(Message):
         """No look can be taken any more."""
 
@@ -95,9 +98,8 @@ class TopApp(App[None]):
         return self._rates
 
     def end(self) -> None:
-        """End the screen; may be called from any thread."""
+        """End the screen; may be called from any thread, also before it runs."""
         self._stopped.set()
-        self.call_from_thread(self.exit)
 
     def compose(self) -> ComposeResult:
         """Lay out the headline, the panels and the keys."""
@@ -116,12 +118,21 @@ class TopApp(App[None]):
         """Begin to look."""
         self._arrange()
         self._draw()
+        self.run_worker(self._await_end, thread=True)
         self.run_worker(self._look_on, thread=True)
 
     def on_unmount(self) -> None:
         """Let the thread that looks end."""
         self._stopped.set()
         self._runs.set()
+
+    def _await_end(self) -> None:
+        self._stopped.wait()
+        self.post_message(self.Ended())
+
+    def on_top_app_ended(self) -> None:
+        """End, whatever the thread that looks waits for."""
+        self.exit()
 
     def _look_on(self) -> None:
         while not self._stopped.is_set():
@@ -254,7 +265,7 @@ class TopApp(App[None]):
         panel.move_cursor(row=row, scroll=False)
         panel.scroll_to(*at, animate=False)
         more = f", the first {len(lines)} shown" if count > len(lines) else ""
-        panel.border_title = f"{table.title}: {count}{more}"
+        panel.border_title = f"{table.title}: {count}{more}{table.as_of(rates)}"
         panel.border_subtitle = "" if lines else table.empty
 
     def _headline(self, rates: CellRates) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -43,6 +44,7 @@ class TopTable:
         rows: Its rows in what two looks have shown.
         first: The column that it is sorted by, at first.
         empty: What stands in place of no rows.
+        of_slots: What of it is as of the newest look at slots, which are looked at less often.
     """
 
     key: str
@@ -51,6 +53,14 @@ class TopTable:
     rows: Callable[[CellRates], Sequence[Any]]
     first: int
     empty: str
+    of_slots: str = ""
+
+    def as_of(self, rates: CellRates) -> str:
+        """Return as of when slots are shown, as part of a title; empty: as of now."""
+        if not self.of_slots or rates.data_unix_s in (0.0, rates.unix_s):
+            return ""
+        clock = time.strftime("%H:%M:%S", time.localtime(rates.data_unix_s))
+        return f", {self.of_slots} as of {clock}"
 
     def lines(
         self,
@@ -211,6 +221,7 @@ _ACTORS: Final = TopTable(
     lambda rates: rates.actors,
     0,
     "no actor is connected",
+    "wrote",
 )  # fmt: skip
 
 # ---------------------------------------------------------------- locks
@@ -261,6 +272,7 @@ _DATA: Final = TopTable(
     lambda rates: rates.data,
     1,
     "no data",
+    "all",
 )  # fmt: skip
 
 TABLES: Final = (_SHARDS, _ACTORS, _LOCKS, _DATA, _COUNTERS)
