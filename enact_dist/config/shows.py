@@ -36,6 +36,7 @@ kind             takes the first part of the datum, in the order of its fields, 
 ``json``         anything; long arrays only with dtype and shape
 ===============  ================================================================================
 
+Fields named ``points_m``, ``vertices_m`` and ``triangles`` go before others of their shape.
 ``of = "acquisition.camera"`` starts at that part instead; ``encoding = "bgr8"`` names the colours
 of an image (``rgb8``, ``rgba8``, ``mono8``, ``16UC1`` and ``32FC1`` by shape and dtype).  In a
 frame ``{entity}`` stands for the entity's name and ``{1}``, ``{2}`` … for its segments; without a

@@ -165,8 +165,10 @@ def held_of(locks: Iterable[LockInfo]) -> dict[str, str]:
 
 
 def table(rates: CellRates, key: str) -> str:
-    """Return a table of `enact top`, named by its key."""
+    """Return a table of `enact top`, named by its key; without what needs a look at all slots."""
     (found,) = (one for one in TABLES if one.key == key)
     lines, count = found.lines(rates, markup.ROWS_SHOWN_MAX)
-    columns = [column.name for column in found.columns]
-    return markup.table(columns, lines, empty=found.empty, count=count)
+    names = [column.name for column in found.columns]
+    kept = [index for index, name in enumerate(names) if name != "wrote"]
+    rows = [[line[index] for index in kept] for line in lines]
+    return markup.table([names[index] for index in kept], rows, empty=found.empty, count=count)

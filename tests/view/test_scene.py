@@ -1,6 +1,7 @@
 """From data to nodes: what is drawn, where, in which colour, and what is left out."""
 
 import struct
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from io import BytesIO
 
@@ -232,11 +233,40 @@ def test_a_node_is_made_once_for_each_version():
     newer = shown(np.zeros((6, 8, 3), np.uint8), "image", entity="camera/1", version=2)
     camera = lens()
     first, again, other = (
-        scene_of({each.recorded.slot: each for each in (one, camera)}).nodes["camera camera/1"]
+        scene_of({each.recorded.slot: each for each in (one, camera)}).nodes[
+            "online:camera/1/x#camera"
+        ]
         for one in (image, image, newer)
     )
     assert first is again
     assert first is not other
+
+
+def test_of_two_images_in_one_frame_one_is_drawn_and_the_other_named():
+    """A colour and a depth image of one camera lie in one another."""
+    pixels = np.zeros((6, 8, 3), np.uint8)
+    colour = shown(pixels, "image", entity="camera/1", aspect="colour")
+    depth = shown(np.ones((6, 8), np.uint16), "image", entity="camera/1", aspect="depth")
+    both = scene_of({one.recorded.slot: one for one in (colour, depth, lens())})
+    alone = scene_of({one.recorded.slot: one for one in (depth, lens())})
+    assert [type(node) for node in both.nodes.values()] == [FrustumNode]
+    assert any("camera/1/depth is behind online:camera/1/colour" in one for one in both.remarks)
+    (node,) = alone.nodes.values()
+    assert node.image.shape[:2] == (6, 8)
+
+
+def test_pictures_of_one_image_with_masks_of_many_versions_are_few():
+    """They would keep the masks alive; pages of several threads make them at once."""
+    image = shown(np.zeros((6, 8, 3), np.uint8), "image", entity="camera/1")
+
+    def draw(first):
+        for number in range(first, first + 300):
+            mask = shown(np.eye(6, 8) > 0, "mask", entity="camera/1", aspect="mask", version=number)
+            scene_of({one.recorded.slot: one for one in (image, mask)})
+
+    with ThreadPoolExecutor(3) as threads:
+        list(threads.map(draw, (1, 1001, 2001)))
+    assert len(image.made) <= scenes.VARIANTS_MAX + 4  # three threads, and the node of no mask
 
 
 @pytest.mark.parametrize(
@@ -298,6 +328,43 @@ def test_an_image_is_a_png_in_full_size():
 def test_a_datum_without_a_shape_is_no_file(make):
     with pytest.raises(ConfigError, match="is shown as json"):
         make(shown(1.5))
+
+
+def test_a_label_stands_at_the_image_of_a_camera():
+    """Its node is named as all others are."""
+    image = shown(np.zeros((6, 8, 3), np.uint8), "image", entity="camera/1")
+    scene = scene_of({image.recorded.slot: image})
+    assert list(labels_of(scene, {"camera/1": "late"})) == ["label camera/1"]
+
+
+def test_an_image_of_numbers_is_a_png_of_the_same_numbers():
+    """A depth in millimetres has 16 bits."""
+    import imageio.v3 as imageio
+
+    depth = np.array([[1000, 2000], [3000, 65535]], np.uint16)
+    assert imageio.imread(png_of(shown(depth, "image"))).tolist() == depth.tolist()
+
+
+def test_what_lies_too_far_apart_or_in_another_type_is_left_out_not_raised():
+    """A thread of all pages draws it."""
+    far = np.array([[-(2**63), 0, 0], [2**63 - 1, 0, 0]], np.int64)
+    voxels = shown(Occupied(far, 0.1), "voxels")
+    assert scene_of({voxels.recorded.slot: voxels}).nodes == {}
+    half = shown(np.eye(4, dtype=np.float16), "transform", inverse=True, parent="cell")
+    assert scene_of({half.recorded.slot: half}).nodes == {}
+    bits = shown({"packed": np.ones((4, 1), bool)}, "mask")
+    assert scene_of({bits.recorded.slot: bits}).nodes
+
+
+def test_named_fields_go_before_those_that_look_alike():
+    """Colours are no triangles, and normals no points."""
+    corners, faces = np.eye(3), np.array([[0, 1, 2]])
+    mesh = shown(
+        {"colours": np.zeros((3, 3), np.uint8), "vertices_m": corners, "triangles": faces}, "mesh"
+    )
+    cloud = shown({"normals": np.zeros((3, 3)), "points_m": corners}, "point_cloud")
+    assert mesh.drawables["mesh"].triangles.tolist() == faces.tolist()
+    assert cloud.drawables["point_cloud"].points_m.tolist() == corners.tolist()
 
 
 def test_slots_of_samples_are_named():

@@ -24,7 +24,7 @@ from enact_dist.recording.drawing.parts import (
 from enact_dist.recording.drawing.solids import Capsule, capsule_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from numpy.typing import NDArray
 
@@ -182,22 +182,28 @@ def _image(part: object, shows: Shows) -> ShownImage | None:
 def _mask(part: object, _: Shows) -> ShownImage | None:
     for array, beside in arrays_of(part):
         if array.ndim == 2 and array.dtype.kind + str(array.dtype.itemsize) in ("b1", "u1"):
-            if array is beside.get("packed"):
+            if array is beside.get("packed") and array.dtype == np.uint8:
                 array = np.unpackbits(array, axis=1)  # noqa: PLW2901 - bits for pixels
             return ShownImage(np.where(array != 0, np.uint8(255), np.uint8(0)), "mono8")
     return None
 
 
+def _named_first(part: object, name: str) -> list[tuple[NDArray[Any], Mapping[str, object]]]:
+    """Return the arrays of a part with the fields beside each, those of a field's name first."""
+    return sorted(arrays_of(part), key=lambda found: found[0] is not found[1].get(name))
+
+
 def _point_cloud(part: object, _: Shows) -> ShownCloud | None:
-    for array, beside in arrays_of(part):
+    for array, beside in _named_first(part, "points_m"):
         if is_points(array):
             return ShownCloud(array, array_beside(beside, "u", len(array)))
     return None
 
 
 def _mesh(part: object, _: Shows) -> ShownMesh | None:
-    for array, beside in arrays_of(part):
-        triangles = array_beside(beside, "iu") if is_points(array) else None
+    for array, beside in _named_first(part, "vertices_m"):
+        named = {name: beside[name] for name in ("triangles",) if name in beside}
+        triangles = array_beside({**named, **beside}, "iu") if is_points(array) else None
         if triangles is not None:
             return ShownMesh(array, triangles)
     return None
@@ -211,7 +217,7 @@ def _voxels(part: object, shows: Shows) -> ShownVoxels | None:
         origin_m = beside.get("origin_m")
         if not isinstance(origin_m, np.ndarray) or origin_m.dtype.kind not in "fiu":
             origin_m = np.array(shows.origin_m)
-        if not voxel_m or origin_m.shape != (3,):
+        if not voxel_m or origin_m.shape != (3,) or not np.isfinite(origin_m).all():
             return None
         return ShownVoxels(array, voxel_m, origin_m)
     return None
@@ -256,7 +262,7 @@ def _transform(part: object, shows: Shows) -> ShownTransform | None:
     matrix = _rigid(part)
     if matrix is None:
         return None
-    return ShownTransform(np.linalg.inv(matrix) if shows.inverse else matrix)
+    return ShownTransform(np.linalg.inv(matrix.astype(np.float64)) if shows.inverse else matrix)
 
 
 def _calibration(part: object, _: Shows) -> ShownCamera | None:

@@ -80,11 +80,13 @@ def _coded(voxels: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64], 
 
     A layer of nothing stands all around.
     """
+    corners = voxels.min(axis=0), voxels.max(axis=0)
+    apart = max(float(high) - float(low) for low, high in zip(*corners, strict=True)) + 3.0
+    if apart > VOXELS_MAX:
+        raise ValueError(f"voxels lie {apart:.0f} apart; a grid has at most {VOXELS_MAX}")
     indices = np.asarray(voxels, np.int64)
     lowest = indices.min(axis=0) - 1
     extent = indices.max(axis=0) - lowest + 2
-    if extent.max() > VOXELS_MAX:
-        raise ValueError(f"voxels lie {extent.max()} apart; a grid has at most {VOXELS_MAX}")
     strides = np.array([extent[1] * extent[2], extent[2], 1])
     return (indices - lowest) @ strides, lowest, extent
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def png_of(shown: ShownDatum) -> bytes:
-    """Return the image of a datum in its full size.
+    """Return the image of a datum in its full size; floats are drawn, all others as they are.
 
     Raises:
         ConfigError: The datum is shown as no image.
@@ -28,8 +28,11 @@ def png_of(shown: ShownDatum) -> bytes:
 
     for drawable in shown.drawables.values():
         if isinstance(drawable, ShownImage):
+            as_it_is = drawable.encoding in {"mono8", "rgb8", "rgba8", "16UC1"}
+            size_px = max(drawable.pixels.shape)
+            pixels = drawable.pixels if as_it_is else rgb_of(drawable, size_px)
             stream = BytesIO()
-            imageio.imwrite(stream, rgb_of(drawable, max(drawable.pixels.shape)), extension=".png")
+            imageio.imwrite(stream, pixels, extension=".png")
             return stream.getvalue()
     raise ConfigError(f"{shown.recorded.slot} is shown as {_kinds(shown)}, so it has no image")
 

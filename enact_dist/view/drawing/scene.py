@@ -53,8 +53,8 @@ POINTS_MAX: Final = 100_000
 TRIANGLES_MAX: Final = 300_000
 CUBES_MAX: Final = 1_000
 """More voxels than this are drawn as square points."""
-FRUSTUMS_MAX: Final = 4
-"""Pictures that one image makes: with masks of different versions, in the colours of pages."""
+VARIANTS_MAX: Final = 4
+"""Nodes of one datum: with masks or models of different versions, in the colours of pages."""
 FIELD_RAD: Final = math.radians(50.0)
 """Vertical field of an image whose camera is not known."""
 IN_SCENE: Final = frozenset(
@@ -143,8 +143,9 @@ def scene_of(
             if made is not None:
                 nodes[f"{slot}#{kind}"] = made
             remarks += _thinned(slot, drawable, made)
-    for frame, frustum in _frustums(data, tints).items():
-        nodes[f"camera {frame}"] = frustum
+    for camera in _cameras(data, tints).values():
+        nodes[f"{camera.parts[0].recorded.slot}#camera"] = _frustum(camera)
+        remarks += camera.remarks
     asked = dict.fromkeys([*(node.frame for node in nodes.values()), *transforms])
     frames = placed(transforms, asked)
     if len(frames.roots) > 1:
@@ -214,12 +215,14 @@ def _arm(
     if model is None:
         return None
     key = ("arm", tint, id(model))
-    if key not in shown.made:
+    known = shown.made.get(key)
+    if known is None:
+        _forget_older(shown.made, "arm")
         capsules = arm_capsules(model.value, joints.positions)
         frame = shown.shows.frame_of(shown.recorded.slot.entity)
         node = CapsulesNode(frame, capsules, tint or ARM_COLOUR) if capsules else None
-        shown.made[key] = node, model  # referenced, so that its id stays its own
-    arm: Node | None = shown.made[key][0]
+        known = shown.made[key] = node, model  # referenced, so that its id stays its own
+    arm: Node | None = known[0]
     return arm
 
 
@@ -254,46 +257,61 @@ def _thinned(slot: Slot, drawable: Drawable | None, node: Node | None) -> Iterat
 class _Camera:
     """What is known of the camera of a frame."""
 
+    frame: str
     image: ShownDatum | None = None
     masks: list[ShownDatum] = field(default_factory=list)
     calibration: ShownDatum | None = None
     tint: Colour | None = None
+    remarks: list[str] = field(default_factory=list)
+
+    @property
+    def parts(self) -> list[ShownDatum]:
+        """All of them, at least one."""
+        every = (self.image, *self.masks, self.calibration)
+        return [one for one in every if one is not None]
 
 
-def _frustums(
-    data: Mapping[Slot, ShownDatum], tints: Mapping[Slot, Colour]
-) -> dict[str, FrustumNode]:
+def _cameras(data: Mapping[Slot, ShownDatum], tints: Mapping[Slot, Colour]) -> dict[str, _Camera]:
     cameras: dict[str, _Camera] = {}
     for slot, shown in data.items():
         frame = shown.shows.frame_of(slot.entity)
         for kind, drawable in shown.drawables.items():
             if not isinstance(drawable, ShownImage | ShownCamera):
                 continue
-            camera = cameras.setdefault(frame, _Camera())
+            camera = cameras.setdefault(frame, _Camera(frame))
             camera.tint = tints.get(slot, camera.tint)
-            if kind == "image":
+            if kind == "image" and camera.image is not None:
+                first = camera.image.recorded.slot
+                camera.remarks.append(f"{slot} is behind {first}: hide that to see this image")
+            elif kind == "image":
                 camera.image = shown
             elif kind == "mask":
                 camera.masks.append(shown)
             else:
                 camera.calibration = shown
-    return {frame: _frustum(frame, camera) for frame, camera in cameras.items()}
+    return cameras
 
 
-def _frustum(frame: str, camera: _Camera) -> FrustumNode:
-    parts = [one for one in (camera.image, *camera.masks, camera.calibration) if one is not None]
-    made, key = parts[0].made, ("frustum", camera.tint, *map(id, parts[1:]))
-    if key not in made:
-        older = [each for each in made if isinstance(each, tuple) and each[0] == "frustum"]
-        for each in older[: 1 - FRUSTUMS_MAX]:
-            del made[each]
+def _frustum(camera: _Camera) -> FrustumNode:
+    first, *others = camera.parts
+    key = ("frustum", camera.tint, *map(id, others))
+    known = first.made.get(key)
+    if known is None:
+        _forget_older(first.made, "frustum")
         # The parts stay referenced with the node, so that their ids stay theirs.
-        made[key] = _new_frustum(frame, camera), parts[1:]
-    node: FrustumNode = made[key][0]
+        known = first.made[key] = _new_frustum(camera), others
+    node: FrustumNode = known[0]
     return node
 
 
-def _new_frustum(frame: str, camera: _Camera) -> FrustumNode:
+def _forget_older(made: dict[object, Any], what: str) -> None:
+    """Keep the newest few nodes of a kind; threads of other pages may do the same."""
+    older = [each for each in list(made) if isinstance(each, tuple) and each[0] == what]
+    for each in older[: 1 - VARIANTS_MAX]:
+        made.pop(each, None)
+
+
+def _new_frustum(camera: _Camera) -> FrustumNode:
     image = None
     pictures = [(camera.image, "image")] + [(mask, "mask") for mask in camera.masks]
     for shown, kind in pictures:
@@ -307,7 +325,8 @@ def _new_frustum(frame: str, camera: _Camera) -> FrustumNode:
     else:
         shape = image.shape if image is not None else (3, 4)
         field_rad, aspect = FIELD_RAD, shape[1] / shape[0]
-    return FrustumNode(frame, field_rad, aspect or 1.0, image, camera.tint or FRUSTUM_COLOUR)
+    colour = camera.tint or FRUSTUM_COLOUR
+    return FrustumNode(camera.frame, field_rad, aspect or 1.0, image, colour)
 
 
 # ---------------------------------------------------------------- extent, labels

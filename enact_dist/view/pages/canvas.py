@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from functools import singledispatchmethod
 from typing import TYPE_CHECKING, Any, Final
@@ -60,6 +61,7 @@ class Canvas:
         self._drawn: dict[str, tuple[Node, Any, str]] = {}
         self._frames: dict[str, tuple[NDArray[np.float64], Any]] = {}
         self._numbers: dict[str, int] = {}
+        self._next = itertools.count()
         self.size_m = 1.0
 
     def draw(self, scenes: Mapping[str, SceneView]) -> int:
@@ -74,15 +76,26 @@ class Canvas:
             wanted = {f"{side}{name}" for side, scene in scenes.items() for name in scene.nodes}
             for name in [name for name in self._drawn if name not in wanted]:
                 self._drawn.pop(name)[1].remove()
+                self._numbers.pop(name, None)
             for side, scene in scenes.items():
                 for frame, pose in scene.frames.items():
                     self._place(f"{side}{frame}", pose)
                 for name, node in scene.nodes.items():
                     known = self._drawn.get(f"{side}{name}")
-                    if known is None or known[0] is not node:
+                    if known is None or not _is_same(known[0], node):
                         self._send(f"{side}{name}", f"{side}{node.frame}", node)
                         sent += 1
+            self._leave(scenes)
         return sent
+
+    def _leave(self, scenes: Mapping[str, SceneView]) -> None:
+        """Remove the frames in which nothing stands any more."""
+        wanted = {f"{side}{frame}" for side, scene in scenes.items() for frame in scene.frames}
+        for side, scene in scenes.items():
+            wanted.update(f"{side}{node.frame}" for node in scene.nodes.values())
+        for frame in self._frames.keys() - wanted:
+            self._frames.pop(frame)[1].remove()
+            self._numbers.pop(f"frame {frame}", None)
 
     def fit(self, low_m: NDArray[np.float64], high_m: NDArray[np.float64]) -> None:
         """Look at everything between two corners (3,); choose the sizes of axes, frusta, points."""
@@ -135,7 +148,9 @@ class Canvas:
 
     def _number(self, name: str) -> int:
         """Return the number that stands for a name in the paths of the scene."""
-        return self._numbers.setdefault(name, len(self._numbers))
+        if name not in self._numbers:
+            self._numbers[name] = next(self._next)
+        return self._numbers[name]
 
     # ------------------------------------------------------------ kinds
 
@@ -251,6 +266,14 @@ class Canvas:
     @_add.register
     def _(self, node: LabelNode, path: str) -> Any:
         return self._scene.add_label(path, node.text, position=tuple(node.place_m))
+
+
+def _is_same(before: Node, node: Node) -> bool:
+    """Whether what is drawn looks like a node: labels are made anew for each picture."""
+    if not isinstance(before, LabelNode) or not isinstance(node, LabelNode):
+        return before is node
+    same = (before.frame, before.text) == (node.frame, node.text)
+    return same and np.array_equal(before.place_m, node.place_m)
 
 
 class _Capsules:

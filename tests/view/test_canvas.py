@@ -1,0 +1,43 @@
+"""What one browser is sent, and what is taken away again; the browser's handle is a recorder."""
+
+from unittest.mock import MagicMock
+
+import numpy as np
+
+from enact_dist.view.drawing.nodes import AxesNode, LabelNode
+from enact_dist.view.drawing.scene import SceneView
+from enact_dist.view.pages.canvas import Canvas
+
+
+def scene(*nodes):
+    """Return a scene of these nodes, each with a frame of its name at the origin."""
+    return SceneView(
+        {f"{node.frame}/{number}": node for number, node in enumerate(nodes)},
+        {node.frame: np.eye(4) for node in nodes},
+        (),
+    )
+
+
+def test_a_label_that_reads_and_stands_as_before_is_sent_once():
+    """It is made anew for each picture."""
+    client = MagicMock()
+    canvas = Canvas(client)
+    sent = [
+        canvas.draw({"": scene(LabelNode("cup", text, np.zeros(3)))})
+        for text in ("late", "late", "on time")
+    ]
+    assert sent == [1, 0, 1]
+    assert client.scene.add_label.call_count == 2
+
+
+def test_frames_of_entities_that_have_gone_are_removed():
+    """A cell makes and drops entities all day; nothing of them stays in a page."""
+    client = MagicMock()
+    client.scene.add_frame.side_effect = lambda *_, **__: MagicMock()
+    canvas = Canvas(client)
+    for number in range(50):
+        canvas.draw({"": scene(AxesNode(f"piece/{number}", np.eye(4)))})
+    paths = [call.args[0] for call in client.scene.add_frame.call_args_list]
+    assert len(canvas._frames) == len(canvas._drawn) == 1
+    assert len(canvas._numbers) == 2
+    assert len(set(paths)) == len(paths) == 100
