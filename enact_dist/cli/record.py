@@ -11,6 +11,7 @@ from enact_dist.cli.arguments import (
     COMPRESSIONS,
     ENTITIES,
     TIMEOUT,
+    label,
     one_entity,
     pair,
     pairs,
@@ -87,6 +88,9 @@ _STEP: Final = OptionGroup(
         option("--keep-as", "NAME",
                "keep the world context of the step, else it is dropped; of several, each is called"
                " NAME-WORLD", default=""),
+        option("--invalidate", "LABEL",
+               "then make the version null, and what was made of it, as enact invalidate does",
+               type=label),
     ),
     """\
 The step runs in world contexts of its own and writes no other.  Its code is not

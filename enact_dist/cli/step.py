@@ -36,13 +36,18 @@ def run_step(options: argparse.Namespace) -> int:
         raise ConfigError(f"--step: {error}") from None
     actor, worlds = _actor(options)
     with open_cell(options, observer=False, actor="replay") as cell:
-        result = Step(cell, world, entity, aspect, version).run(
+        step = Step(cell, world, entity, aspect, version)
+        result = step.run(
             actor, worlds, keep_as=options.keep_as, tolerances=_tolerances(options, actor)
         )
+        replaced = cell.invalidate(options.invalidate, step.made) if options.invalidate else ()
     if options.json:
-        print_json(result.to_json())
+        invalidated = [{**one.slot._asdict(), "version": one.version} for one in replaced]
+        print_json({**result.to_json(), "invalidated": invalidated})
     else:
         _print(result)
+        for one in replaced:
+            print(f"{one.slot} v{one.version} is null now")
     if result.error:
         return FAILED
     return DIFFERENT if result.differs else DONE

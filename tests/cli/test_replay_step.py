@@ -176,3 +176,19 @@ def test_view_of_the_step_has_its_data_at_once(weighed):
         assert cell.world(names["online"]).view(weight)[weight] == 45.0
         for name in names.values():
             cell.drop_world(name)
+
+
+def test_a_wrong_step_becomes_null_on_request(replay, enact, weighed):
+    """What was made of it, too.  This test is the last of the file: the cell is another one then."""
+    with connect(weighed) as cell:
+        online = cell.world("online")
+        write = Write(online, PIECE, Aspect("verdict", str))
+        with Lock(write, View(online, PIECE, WEIGHT)) as lock:
+            lock[write] = "heavy"
+    found = replay("--name", "scale", "--option", "factor=1.0", "--invalidate", "bad", "--json")
+
+    assert found.status == 0
+    made = [(one["aspect"], one["version"]) for one in found.json["invalidated"]]
+    assert made == [("weight", 4), ("verdict", 1)]
+    refused = enact("world", "get", "online", "piece/1/weight", "--cell", weighed)
+    assert "is null (deleted)" in refused.err

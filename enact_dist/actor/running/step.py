@@ -107,12 +107,16 @@ class Step:
         MisuseError: There is no such version yet, or it is not known which commit made it.
         UnknownWorldError: The cell has no world context of that name.
         ShardUnreachableError: A shard does not answer.
+
+    Attributes:
+        made: The version.
     """
 
     def __init__(self, cell: Cell, world: str, entity: str, aspect: str, version: int = 0) -> None:
         refuse_inside_lock("Step")
         self._cell = cell
         self._past = PastStep(cell, world, entity, aspect, version)
+        self.made = self._past.made
         self._session = self._past.session
 
     def run(
