@@ -60,7 +60,7 @@ def options_of(config: Path, out: Path, *, quiet: bool = False) -> Options:
     given: dict[str, Any] = {
         name: value
         for name, value in setup.options.items()
-        if name in {"scenario", "seed", "seconds", "voxel_m"}
+        if name in {"scenario", "seed", "seconds", "voxel_m", "scale"}
     }
     source = str(camera.options.get("source", "live"))
     separate = camera.class_path == CAMERA
@@ -81,6 +81,7 @@ def configured(template: str, options: Options) -> dict[str, Any]:
         "seed": options.seed,
         "seconds": options.seconds,
         "voxel_m": options.voxel_m,
+        "scale": options.scale,
     }
     for table in actors.values():
         if table["class"] == CAMERA:

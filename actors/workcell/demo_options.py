@@ -16,6 +16,7 @@ PLAYED: Final = ("playback+robot", "playback")
 VOXEL_M_MIN: Final = 0.01
 VOXEL_M_MAX: Final = 0.2
 """A voxel of 1 cm takes 35 million; one of 20 cm is larger than an arm."""
+SCALE_MIN: Final = 0.25
 SEED: Final = 1
 """The seed of a plain run."""
 
@@ -31,6 +32,7 @@ class Options:
         seconds: How long it lasts.
         source: Address of the cameras' source; one of `PLAYED` alone plays what is kept for it.
         voxel_m: Edge of a voxel.
+        scale: Of the images: 1 is 640 x 480 pixels, 0.5 a quarter of the work.
         embedded: All in this process, in place of processes.
         separate: Camera, learning and subtraction are actors of their own, as in Figure 4 of the
             paper, in place of one `SmartCamera` per camera.
@@ -49,6 +51,7 @@ class Options:
     seconds: float = SECONDS
     source: str = PLAYED[0]
     voxel_m: float = 0.025
+    scale: float = 1.0
     embedded: bool = False
     separate: bool = False
     quiet: bool = False
@@ -60,6 +63,13 @@ class Options:
             raise ConfigError(
                 f"--voxel-m is {self.voxel_m:g}; a voxel of {VOXEL_M_MIN:g} to {VOXEL_M_MAX:g} m is"
                 " small enough for a person and large enough for the memory"
+            )
+        if not SCALE_MIN <= self.scale <= 1.0:
+            raise ConfigError(f"--scale is {self.scale:g}; it may be {SCALE_MIN:g} to 1")
+        if self.scale < 1.0 and self.source != "live":
+            raise ConfigError(
+                f"--scale {self.scale:g}: views that were drawn before have 640 x 480 pixels; draw"
+                " smaller ones with --live"
             )
         if self.out.exists() and not self.out.is_dir():
             raise ConfigError(f"--out {self.out} is a file; name a folder, it need not exist")

@@ -88,6 +88,7 @@ class Setup(Actor):
         confirm: The cell is confirmed empty at once and the scenario begins when this many
             seconds have passed; 0: the operator does both.
         cameras: How many of the room's eight cameras the cell has, the first ones.
+        scale: Of their images: 1 is 640 x 480 pixels.
     """
 
     online, truth = World("online"), World("truth")
@@ -108,17 +109,20 @@ class Setup(Actor):
         voxel_m: float = 0.025,
         confirm: float = 0.0,
         cameras: int = CAMERA_COUNT,
+        scale: float = 1.0,
     ) -> None:
         scenario_of(scenario, seed, seconds)  # refuses what does not exist
         self.scenario, self.seed, self.seconds = scenario, seed, seconds
         self.voxel_m, self.confirm = voxel_m, confirm
         if not 2 <= cameras <= CAMERA_COUNT:
             raise ValueError(f"cameras is {cameras}; the room has 2 to {CAMERA_COUNT}")
-        self.cameras = cameras
+        if not 0.25 <= scale <= 1.0:
+            raise ValueError(f"scale is {scale:g}; images have 0.25 to 1 times 640 x 480 pixels")
+        self.cameras, self.scale = cameras, scale
 
     def update(self, lock: Lock) -> None:
         """Write it."""
-        for number, calibration in enumerate(cameras()[: self.cameras]):
+        for number, calibration in enumerate(cameras(self.scale)[: self.cameras]):
             lock[self.calibrations][camera_entity(number)] = calibration
         scenario = scenario_of(self.scenario, self.seed, self.seconds)
         for number, box in enumerate(boxes_of(scenario)):

@@ -46,6 +46,8 @@ VERBS: Final = (
             seconds_of("--seconds", "how long (default 60)"),
             _OUT,
             option("--voxel-m", "M", "edge of a voxel (default 0.025)", type=float),
+            option("--scale", "X", "of the images, with --live: 0.5 is a quarter of the pixels",
+                   type=float),
             flag("--live", "render the images at run time"),
             file_of("--play", "DIR", "play views recorded there"),
             file_of("--record", "DIR", "draw the views there, and end"),

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 _EXTRA: Final = ("cv2", "scipy", "numba", "mujoco", "ompl", "ruckig")
 """Modules of the `workcell` extra, which the core does without."""
-_CHOICES: Final = ("scenario", "seed", "seconds", "voxel_m", "source")
+_CHOICES: Final = ("scenario", "seed", "seconds", "voxel_m", "scale", "source")
 
 
 def run_workcell(options: argparse.Namespace) -> int:
@@ -94,6 +94,7 @@ def _refuse_mixture(options: argparse.Namespace) -> None:
         "seed",
         "seconds",
         "voxel_m",
+        "scale",
         "live",
         "play",
         "record",

@@ -40,6 +40,7 @@ def test_cell_of_a_run_differs_only_in_what_a_run_chooses(tmp_path):
         "seed": 5,
         "seconds": 9.0,
         "voxel_m": 0.05,
+        "scale": 1.0,
     }
     shipped["actors"]["setup"].pop("args", None)
     for number in range(words.CAMERA_COUNT):
@@ -138,3 +139,14 @@ def test_the_cell_of_four_cameras_is_sound(tmp_path):
     }
     assert silhouettes == {f"camera/{number}" for number in range(4)}
     assert [one for one in check_cell(found) if one.level == "error"] == []
+
+
+def test_images_may_be_smaller_where_they_are_drawn_live(tmp_path):
+    """Views that were drawn before have their size."""
+    live = Options(tmp_path, source="live", scale=0.5)
+
+    assert configured(TEMPLATE.read_text(), live)["actors"]["setup"]["args"]["scale"] == 0.5
+    with pytest.raises(ConfigError, match="draw smaller ones with --live"):
+        Options(tmp_path, scale=0.5)
+    with pytest.raises(ConfigError, match=r"may be 0\.25 to 1"):
+        Options(tmp_path, source="live", scale=2.0)
