@@ -14,6 +14,7 @@ new one: its number does not continue the old count, and how many versions were 
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -23,9 +24,9 @@ from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Self, TypeVar
 
 from enact_dist.access.arguments import check_seconds
 from enact_dist.core.protocol.datum import Position, Slot
-from enact_dist.core.protocol.messages import Notice, Survey, Surveyed
+from enact_dist.core.protocol.messages import Notice, Ping, Survey, Surveyed
 from enact_dist.core.state.clock import STAMP_NS_MAX, is_kept
-from enact_dist.errors import ShardUnreachableError
+from enact_dist.errors import LinkError, ShardUnreachableError
 from enact_dist.link.notices import Interest, Skipped
 from enact_dist.terms import Durability, Entities, Entity
 
@@ -41,6 +42,8 @@ QUIET_S: Final = 0.5
 """How often a quiet watch checks whether it lacks any: as often as keep-alives come."""
 RESYNC_S: Final = 1.0
 """How long one attempt to list the slots of a shard again may take."""
+MISSING_S: Final = 0.2
+"""How long a shard that was missing has to answer, so that it delays no change of another."""
 VANISHED: Final = (0, 0)
 """Version and stamp of a slot that its shard does not know any more."""
 
@@ -135,7 +138,10 @@ class _Following:
 
 
 class Watch(Following[Change]):
-    """An iterator of `Change`; also a context manager.  One thread at a time may iterate."""
+    """An iterator of `Change`; also a context manager.  One thread at a time may iterate.
+
+    With `lenient` it begins without the shards that do not answer, and lists each once it does.
+    """
 
     def __init__(
         self,
@@ -143,8 +149,10 @@ class Watch(Following[Change]):
         contexts: tuple[str, ...],
         patterns: tuple[str, ...],
         aspects: tuple[str, ...],
+        *,
+        lenient: bool = False,
     ) -> None:
-        self._client = client
+        self._client, self._lenient = client, lenient
         named = tuple(str(Entities(pattern)) for pattern in patterns)
         self._survey = Survey(contexts, named, aspects)
         self._interest = Interest(self._survey)
@@ -159,7 +167,10 @@ class Watch(Following[Change]):
         try:
             for shard in client.shards():
                 self._following[shard] = _Following()
-                self._list_again(shard, timeout_s=10.0)
+                if not lenient:
+                    self._list_again(shard, timeout_s=10.0)
+                elif self._answers(shard, RESYNC_S):
+                    self._try_list_again(shard)
         except BaseException:
             self._feed.close()
             raise
@@ -266,8 +277,19 @@ class Watch(Following[Change]):
             if behind is None or behind[0] <= known:
                 told = self._client.notice_numbers.get(shard, (0, 0))
                 behind = following.behind = (told, time.monotonic()) if told > known else None
-            if behind is not None and time.monotonic() - behind[1] >= self._feed.late_s:
+            if behind is None or time.monotonic() - behind[1] < self._feed.late_s:
+                continue
+            missing = self._lenient and following.epoch < 0
+            if not missing or self._answers(shard, MISSING_S):
                 self._try_list_again(shard)
+
+    def _answers(self, shard: str, timeout_s: float) -> bool:
+        """Whether a shard answers in time; if not, it is left alone for a while."""
+        with contextlib.suppress(LinkError):
+            if self._client.call_once([(shard, Ping())], timeout_s=timeout_s)[0] is not None:
+                return True
+        self._following[shard].behind = ((0, 0), time.monotonic() + RESYNC_S)
+        return False
 
     def _try_list_again(self, shard: str) -> None:
         try:

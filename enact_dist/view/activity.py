@@ -109,10 +109,11 @@ class Activity:
                     return
                 listed = self._listed.copy()
             begun_s = time.monotonic()
+            for ask in (partial(self._explain, frozenset().union(*listed.values())), self._ask):
+                with contextlib.suppress(EnactError):
+                    ask()
             with contextlib.suppress(EnactError):
-                self._explain(frozenset().union(*listed.values()))
-            with contextlib.suppress(EnactError):
-                self._ask()
+                self._refresh()
             left_s = pause_s(EVERY_S, time.monotonic() - begun_s)
             with self._news:
                 self._news.wait_for(partial(self._is_over, listed), left_s)
@@ -123,13 +124,14 @@ class Activity:
 
     def _explain(self, slots: Iterable[Slot]) -> None:
         states = {slot: self._catalogue.state(slot) for slot in slots}
-        asked = [
-            (slot, state.version) for slot, state in states.items() if state and not state.null
-        ]
-        self._entries = self._source.explained(asked)
-        if any(slot.aspect not in self._types for slot, _ in asked):
-            aspects = self._source.cell.aspects()
-            self._types = {name: type_name(kind) for name, (kind, _) in aspects.items()}
+        self._entries = self._source.explained(
+            {slot: state.version for slot, state in states.items() if state and not state.null}
+        )
+
+    def _refresh(self) -> None:
+        self._catalogue.keep(self._source.refresh())
+        aspects = self._source.session.client.aspect_entries()
+        self._types = {name: type_name(one.fingerprint) for name, one in aspects.items()}
 
     def _ask(self) -> None:
         rates = self._looks.add(self._source.cell.look())

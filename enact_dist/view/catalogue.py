@@ -11,6 +11,8 @@ from enact_dist.cli.text.rates import Rates, Sample
 from enact_dist.patterns import pattern_matches
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from enact_dist.core.protocol.datum import Slot
 
 _NUMBERS: Final = re.compile(r"(\d+)")
@@ -65,8 +67,27 @@ class SlotCatalogue:
         self._states: dict[Slot, ListedState] = {}
         self._by_world: dict[str, list[Slot]] = {}
         self._first: dict[str, Slot] = {}
+        self._worlds: tuple[str, ...] = ()
         self._rates = Rates()
         self.newest_ns = 0
+
+    def clear(self) -> None:
+        """Forget all slots: they are noted anew."""
+        with self._guard:
+            self._states, self._by_world, self._first = {}, {}, {}
+            self._rates = Rates()
+
+    def keep(self, worlds: Iterable[str]) -> None:
+        """Take which world contexts the cell has; forget those of others that have been dropped.
+
+        The data of a dropped one are null; one with others is newer than the list.
+        """
+        with self._guard:
+            self._worlds = tuple(worlds)
+            there = {slot.context for slot, state in self._states.items() if not state.null}
+            kept = there.union(self._worlds)
+            self._states = {slot: at for slot, at in self._states.items() if slot.context in kept}
+            self._by_world = {}
 
     def note(self, slot: Slot, state: ListedState, *, gap: int, now_s: float) -> None:
         """Take a change; the first one of a slot is no change of it."""
@@ -111,9 +132,9 @@ class SlotCatalogue:
             return known
 
     def worlds(self) -> list[str]:
-        """Return the world contexts that have slots."""
+        """Return the world contexts of the cell, and those that have slots."""
         with self._guard:
-            return sorted({slot.context for slot in self._states})
+            return sorted({slot.context for slot in self._states}.union(self._worlds))
 
     def listing(self, world: str, path: str = "", wanted: str = "") -> Listing:
         """Return what the tree shows.

@@ -6,17 +6,15 @@ newest version is fetched, and no more bytes than the limit; what is passed over
 
 from __future__ import annotations
 
-import contextlib
 import threading
 import time
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.access.watch import Watch
 from enact_dist.core.protocol.datum import Slot
-from enact_dist.errors import EnactError, ProtocolError, ShardUnreachableError
+from enact_dist.errors import EnactError
 from enact_dist.view.catalogue import ListedState, SlotCatalogue
 from enact_dist.view.drawing.scene import IN_SCENE, ShownDatum, shown_of
-from enact_dist.view.source import RETRIED
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -26,7 +24,9 @@ if TYPE_CHECKING:
     from enact_dist.view.source import CellSource
 
 AGAIN_S: Final = 1.0
-"""Pause before a shard that did not answer is asked again."""
+"""Pause before a watch that failed is opened again."""
+NAMED_MAX: Final = 3
+"""Most data that cannot be shown whose reasons are."""
 PROBED_MAX: Final = 16
 """Aspects without `shows` whose first datum is looked at in one round."""
 
@@ -61,7 +61,6 @@ class Feed:
         catalogue: All slots.
         passed_over: Versions of shown slots that were not fetched.
         held_back: Rounds in which data waited because of the limit of bytes.
-        round_s: Processor time of the last round.
         moment_ns: The moment of the newest data.
     """
 
@@ -76,14 +75,13 @@ class Feed:
         self._source, self.shows_of = source, shows_of
         self._rate_hz, self._bytes_s = rate_hz, bytes_s
         self.catalogue = SlotCatalogue()
-        self._trouble: dict[str, str] = {}
+        self._trouble = ""
+        self._unfit: dict[Slot, tuple[tuple[int, int], str]] = {}
         self.passed_over = self.held_back = 0
-        self.round_s = 0.0
         self.moment_ns = 0
         self._kinds: dict[str, frozenset[str]] = {}
         self._shown: dict[Slot, ShownDatum] = {}
         self._wishes: dict[object, frozenset[Slot]] = {}
-        self._away: dict[str, float] = {}
         self._budget, self._budget_s = bytes_s, time.monotonic()
         self._news = threading.Condition()
         self._stopped = False
@@ -106,7 +104,13 @@ class Feed:
     @property
     def problem(self) -> str:
         """Why data are missing or old; "" if nothing is wrong."""
-        return "; ".join(self._trouble.copy().values())
+        unfit = [
+            f"{slot} v{state.version} cannot be shown: {why}"
+            for slot, (version, why) in self._unfit.copy().items()
+            if (state := self.catalogue.state(slot)) is not None and state[:2] == version
+        ]
+        away = self._source.away.values()
+        return "; ".join([*filter(None, (self._trouble, *away)), *unfit[:NAMED_MAX]])
 
     def wish(self, page: object, slots: Iterable[Slot] | None) -> None:
         """Set which data a page shows; None: the page has gone."""
@@ -136,10 +140,12 @@ class Feed:
     def _run(self) -> None:
         while self._waits_for_pages():
             try:
-                with Watch(self._source.session.client, (), ("**",), ()) as watch:
+                client = self._source.session.client
+                with Watch(client, (), ("**",), (), lenient=True) as watch:
+                    self.catalogue.clear()  # whatever was dropped while no watch was open
                     self._follow(watch)
-            except EnactError as error:
-                self._trouble[""] = str(error)
+            except Exception as error:  # noqa: BLE001 - this thread is that of all pages
+                self._trouble = str(error) or repr(error)
                 with self._news:
                     self._news.wait_for(lambda: self._stopped, AGAIN_S)
 
@@ -153,9 +159,7 @@ class Feed:
         while not self._stopped and self._wishes:
             now_s = time.monotonic()
             if now_s >= due_s:
-                begun_s = time.thread_time()
                 self._round(now_s)
-                self.round_s = time.thread_time() - begun_s
                 # At most half of the time is spent here, however large the data are.
                 due_s = now_s + max(1.0 / self._rate_hz, 2.0 * (time.monotonic() - now_s))
             self._take(watch, max(0.0, due_s - time.monotonic()))
@@ -179,14 +183,17 @@ class Feed:
                 del self._shown[slot]
         probes = self._probes()
         changed = [slot for slot in wanted if self._is_new(slot)]
-        asked = [slot for slot in {*changed, *probes} if self._may_ask(slot, now_s)]
+        away = self._source.still_away()
+        asked = [s for s in {*changed, *probes} if self._source.shard_of(s) not in away]
         affordable = self._affordable(asked, now_s)
         if affordable:
-            self._fetch(affordable, now_s)
+            self._fetch(affordable)
+        elif not asked:  # what is shown is of this moment, too
+            self.moment_ns = self.catalogue.newest_ns
 
     def _is_new(self, slot: Slot) -> bool:
         state, shown = self.catalogue.state(slot), self._shown.get(slot)
-        if state is None:
+        if state is None or self._unfit.get(slot, ((0, 0), ""))[0] == state[:2]:
             return False
         if shown is None:
             return not state.null
@@ -196,15 +203,9 @@ class Feed:
         """Return one datum of each aspect whose kinds have to be guessed."""
         found: dict[str, Slot] = {}
         for slot in self.catalogue.first_of_aspects():
-            if self.kinds(slot.aspect) is None and len(found) < PROBED_MAX:
+            if self.kinds(slot.aspect) is None and len(found) < PROBED_MAX and self._is_new(slot):
                 found.setdefault(slot.aspect, slot)
         return list(found.values())
-
-    def _may_ask(self, slot: Slot, now_s: float) -> bool:
-        return self._away.get(self._shard_of(slot), 0.0) <= now_s
-
-    def _shard_of(self, slot: Slot) -> str:
-        return self._source.session.client.shard_of(slot.entity)
 
     def _affordable(self, slots: list[Slot], now_s: float) -> list[Slot]:
         """Return the slots for which the limit of bytes has room; a datum's size is its last one.
@@ -227,18 +228,14 @@ class Feed:
         shown = self._shown.get(slot)
         return shown.recorded.stamp_ns if shown is not None else 0
 
-    def _fetch(self, slots: list[Slot], now_s: float) -> None:
+    def _fetch(self, slots: list[Slot]) -> None:
         at_ns = self.catalogue.newest_ns
         try:
             found = self._source.data_at(slots, at_ns)
-        except ShardUnreachableError as error:
-            self._trouble[error.shard] = str(error)
-            self._away[error.shard] = time.monotonic() + AGAIN_S
+        except EnactError as error:
+            self._trouble = str(error)
             return
-        except RETRIED:
-            return
-        for shard in {"", *map(self._shard_of, slots)}:
-            self._trouble.pop(shard, None)
+        self._trouble = ""
         with self._news:
             for slot, recorded in found.data.items():
                 self._show(slot, recorded)
@@ -249,8 +246,12 @@ class Feed:
         before = self._shown.get(slot)
         if before is not None and recorded.version > before.recorded.version + 1:
             self.passed_over += recorded.version - before.recorded.version - 1
-        with contextlib.suppress(ProtocolError):
+        try:
             shown = shown_of(recorded, self.shows_of(slot.aspect))
-            if not shown.shows.kinds and recorded.datum is not None:
-                self._kinds[slot.aspect] = frozenset(shown.drawables)
-            self._shown[slot] = shown
+        except Exception as error:  # noqa: BLE001 - one odd datum takes no other with it
+            self._unfit[slot] = (recorded.version, recorded.stamp_ns), str(error) or repr(error)
+            return
+        self._unfit.pop(slot, None)
+        if not shown.shows.kinds and recorded.datum is not None:
+            self._kinds[slot.aspect] = frozenset(shown.drawables)
+        self._shown[slot] = shown

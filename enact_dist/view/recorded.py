@@ -18,7 +18,7 @@ from enact_dist.view.timeline import Timeline
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from enact_dist.config.shows import Shows
     from enact_dist.core.protocol.datum import Slot
@@ -69,8 +69,10 @@ class RecordingSource:
         newest_ns = max(one.stamp_ns for one in commit.versions)
         return newest_ns if commit.number else max(newest_ns, begin_ns)
 
-    def data_at(self, slots: Sequence[Slot], at_ns: int) -> FoundData:
-        """Return data as of a moment.
+    def data_at(
+        self, slots: Sequence[Slot], at_ns: int, before: Mapping[Slot, Recorded] = {}
+    ) -> FoundData:
+        """Return data as of a moment, all of them from the file.
 
         Raises:
             ProtocolError: The recording holds what this version cannot read.

@@ -2,24 +2,32 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
+import time
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeVar
 
 from enact_dist.access.asking import answers_to, explained, in_parts
 from enact_dist.access.snapshot import HeldView
-from enact_dist.core.protocol.messages import Item, ListHistory, SlotVersion, Versions
-from enact_dist.errors import ForgottenError, LeaseLostError
+from enact_dist.core.protocol.messages import Item, ListHistory, Ping, SlotVersion, Versions
+from enact_dist.errors import ForgottenError, LeaseLostError, LinkError, ShardUnreachableError
 from enact_dist.recording.exact import Recorded
 from enact_dist.terms import Access
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from enact_dist.core.protocol.datum import Slot
     from enact_dist.core.protocol.messages import VersionEntry
     from enact_dist.world.cell import Cell
 
+T = TypeVar("T")
+
 TOGETHER_MAX: Final = 512
 """Most slots of one view."""
+AGAIN_S: Final = 1.0
+"""Pause before a shard that did not answer is asked again."""
+PING_S: Final = 0.2
+"""How long such a shard has to answer, so that it delays nothing else."""
 
 Histories = dict["Slot", list[tuple[int, int]]]
 """Version and stamp of every known version, oldest first, by slot."""
@@ -40,8 +48,10 @@ class FoundData(NamedTuple):
 class DataSource(Protocol):
     """A cell, or a recording of one."""
 
-    def data_at(self, slots: Sequence[Slot], at_ns: int) -> FoundData:
-        """Return data as of a moment."""
+    def data_at(
+        self, slots: Sequence[Slot], at_ns: int, before: Mapping[Slot, Recorded] = {}
+    ) -> FoundData:
+        """Return data as of a moment; `before` holds versions that need not be fetched again."""
 
     def histories(self, slots: Sequence[Slot]) -> Histories:
         """Return which versions of these slots are known."""
@@ -50,27 +60,94 @@ class DataSource(Protocol):
 class CellSource:
     """A running cell.  Its session reads only; every view is one of the past, which waits for none.
 
+    A shard that does not answer takes no other with it: what the others have is returned, and
+    `away` names it.
+
     Args:
         cell: An observer's connection.
     """
 
     def __init__(self, cell: Cell) -> None:
         self.cell = cell
-        self.session = cell.world(cell.worlds()[0]).session
+        self.session = cell._session  # noqa: SLF001 - a handle of a world context asks all shards
+        self._away: dict[str, tuple[float, str]] = {}
 
-    def data_at(self, slots: Sequence[Slot], at_ns: int) -> FoundData:
-        """Return data as of a moment, over all shards.
+    # ------------------------------------------------------------ shards
+
+    def shard_of(self, slot: Slot) -> str:
+        """Return the shard that stores a slot."""
+        return self.session.client.shard_of(slot.entity)
+
+    @property
+    def away(self) -> dict[str, str]:
+        """Why shards are not asked now, by their names."""
+        return {shard: why for shard, (_, why) in self._away.copy().items()}
+
+    def still_away(self) -> dict[str, str]:
+        """Return `away` without the shards that answer again, some time after they did not."""
+        for shard, (until_s, why) in self._away.copy().items():
+            if time.monotonic() < until_s:
+                continue
+            if self._is_there(shard):
+                self._away.pop(shard, None)
+            else:
+                self._away[shard] = (time.monotonic() + AGAIN_S, why)
+        return self.away
+
+    def _is_there(self, shard: str) -> bool:
+        try:
+            return self.session.client.call_once([(shard, Ping())], timeout_s=PING_S)[0] is not None
+        except LinkError:
+            return False
+
+    def refresh(self) -> list[str]:
+        """Learn the aspects and world contexts of the shards that answer; return the contexts."""
+        client, away = self.session.client, self.still_away()
+        asked = [shard for shard in client.shards() if shard not in away]
+        client.call_once([(shard, client.core.hello(shard)) for shard in asked])
+        return sorted(client.worlds())
+
+    def _of_those_there(self, slots: Iterable[Slot], ask: Callable[[list[Slot]], T]) -> T:
+        """Ask for slots; without those of a shard that does not answer, if there is one."""
+        away = self.still_away()
+        left = [slot for slot in slots if self.shard_of(slot) not in away]
+        while True:
+            try:
+                return ask(left)
+            except ShardUnreachableError as error:
+                fewer = [slot for slot in left if self.shard_of(slot) != error.shard]
+                if len(fewer) == len(left):
+                    raise
+                self._away[error.shard] = (time.monotonic() + AGAIN_S, str(error))
+                left = fewer
+
+    # ------------------------------------------------------------ data
+
+    def data_at(
+        self, slots: Sequence[Slot], at_ns: int, before: Mapping[Slot, Recorded] = {}
+    ) -> FoundData:
+        """Return data as of a moment, over all shards that answer.
+
+        Args:
+            slots: The slots.
+            at_ns: The moment.
+            before: Versions that are known: they are not fetched again.
 
         Raises:
-            ShardUnreachableError: A shard does not answer.
+            LockTimeoutError: A commit before the moment is still undecided.
         """
+        return self._of_those_there(slots, lambda there: self._data_at(there, at_ns, before))
+
+    def _data_at(
+        self, slots: Sequence[Slot], at_ns: int, before: Mapping[Slot, Recorded]
+    ) -> FoundData:
         data: dict[Slot, Recorded] = {}
         forgotten: list[Slot] = []
         left = [*in_parts(slots, TOGETHER_MAX)]
         while left:
             some = left.pop()
             try:
-                data |= self._viewed(some, at_ns)
+                data |= self._viewed(some, at_ns, before)
             except ForgottenError:
                 if len(some) == 1:
                     forgotten += some
@@ -78,34 +155,47 @@ class CellSource:
                     left += in_parts(some, -(-len(some) // 2))
         return FoundData(data, tuple(sorted(forgotten)))
 
-    def _viewed(self, slots: Sequence[Slot], at_ns: int) -> dict[Slot, Recorded]:
+    def _viewed(
+        self, slots: Sequence[Slot], at_ns: int, before: Mapping[Slot, Recorded]
+    ) -> dict[Slot, Recorded]:
+        try:
+            return self._viewed_once(slots, at_ns, before)
+        except LeaseLostError:  # the data of the view were removed before they were fetched
+            return self._viewed_once(slots, at_ns, before)
+
+    def _viewed_once(
+        self, slots: Sequence[Slot], at_ns: int, before: Mapping[Slot, Recorded]
+    ) -> dict[Slot, Recorded]:
         items = [Item(int(Access.VIEW), *slot) for slot in slots]
         with HeldView(self.session, items, past_ns=at_ns) as view:
-            data = view.fetch([one for one in view.states if not one.state.null_reason])
-            return {
-                state.slot: Recorded(
-                    state.slot,
-                    state.version,
-                    state.stamp_ns,
-                    shard,
-                    0,
-                    data.get(state.slot),
-                    state.null_reason,
-                )
-                for shard, _, state in view.states
-            }
+            found: dict[Slot, Recorded] = {}
+            for shard, _, state in view.states:
+                known = before.get(state.slot)
+                version = (state.version, state.stamp_ns)
+                if known is not None and (known.version, known.stamp_ns) == version:
+                    found[state.slot] = known
+                else:
+                    facts = (state.slot, *version, shard, 0)
+                    found[state.slot] = Recorded(*facts, None, state.null_reason)
+            new = [
+                one
+                for one in view.states
+                if found[one.state.slot].datum is None and not one.state.null_reason
+            ]
+            for slot, datum in view.fetch(new).items():
+                found[slot] = replace(found[slot], datum=datum)
+            return found
 
     def histories(self, slots: Sequence[Slot]) -> Histories:
-        """Return which versions of these slots the shards still know.
+        """Return which versions of these slots the shards that answer still know."""
+        return self._of_those_there(slots, self._histories)
 
-        Raises:
-            ShardUnreachableError: A shard does not answer.
-        """
+    def _histories(self, slots: Sequence[Slot]) -> Histories:
         client = self.session.client
         wanted = set(slots)
         groups: dict[tuple[str, str, str], list[str]] = {}
         for slot in slots:
-            place = (client.shard_of(slot.entity), slot.context, slot.aspect)
+            place = (self.shard_of(slot), slot.context, slot.aspect)
             groups.setdefault(place, []).append(slot.entity)
         calls = [
             (shard, ListHistory((context,), entities, (aspect,)))
@@ -120,16 +210,12 @@ class CellSource:
                     found.setdefault(state.slot, []).append((state.version, state.stamp_ns))
         return {slot: sorted(each, key=lambda one: one[1]) for slot, each in found.items()}
 
-    def explained(self, versions: Iterable[tuple[Slot, int]]) -> dict[Slot, VersionEntry]:
-        """Return size and writer of versions.
+    def explained(self, versions: Mapping[Slot, int]) -> dict[Slot, VersionEntry]:
+        """Return size and writer of a version of each of some slots whose shards answer."""
 
-        Raises:
-            ShardUnreachableError: A shard does not answer.
-        """
-        asked = [SlotVersion(slot, version) for slot, version in versions]
-        answers = explained(self.session.client, asked)
+        def ask(slots: list[Slot]) -> list[Versions]:
+            asked = [SlotVersion(slot, versions[slot]) for slot in slots]
+            return explained(self.session.client, asked)
+
+        answers = self._of_those_there(versions, ask)
         return {entry.state.slot: entry for answer in answers for entry in answer.entries}
-
-
-RETRIED: Final = (LeaseLostError,)
-"""Errors of a view whose data were removed before they were fetched: view again."""

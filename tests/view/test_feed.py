@@ -8,7 +8,9 @@ import pytest
 from enact_dist import Aspect, Entity, Lock, Retention, Write, local
 from enact_dist.config.shows import GUESSED, Shows
 from enact_dist.core.protocol.datum import Slot
+from enact_dist.errors import UnknownWorldError
 from enact_dist.recording import Recorder
+from enact_dist.view import feed as feeds
 from enact_dist.view.activity import Activity
 from enact_dist.view.feed import Feed
 from enact_dist.view.pages.comparing import MARKED, NOW, Side
@@ -109,8 +111,74 @@ def test_passed_over_versions_and_bytes_are_counted(cell):
         slow.stop()
 
 
+def test_an_odd_datum_is_named_and_takes_no_other_with_it(cell, feed, monkeypatch):
+    """Its next version is shown again."""
+    real, tried = feeds.shown_of, []
+
+    def odd(recorded, shows):
+        if recorded.slot == SLOT and recorded.version == 1:
+            tried.append(recorded)
+            raise ZeroDivisionError("no scale")
+        return real(recorded, shows)
+
+    monkeypatch.setattr(feeds, "shown_of", odd)
+    feed.wish("page", [SLOT, SPEED_SLOT])
+    until(lambda: feed.shown([SPEED_SLOT]) and feed.problem)
+    assert feed.problem == "online:arm/pose v1 cannot be shown: no scale"
+    until(lambda: feed.moment_ns == feed.catalogue.newest_ns)
+    assert len(tried) == 1
+    move(cell, 2.0)
+    until(lambda: feed.shown([SLOT]))
+    assert feed.problem == ""
+
+
+def test_the_feed_outlives_whatever_its_watch_raises(cell, feed, monkeypatch):
+    real, failures = feeds.Watch, [RuntimeError("out of luck")]
+
+    def watch(*given, **options):
+        if failures:
+            raise failures.pop()
+        return real(*given, **options)
+
+    monkeypatch.setattr(feeds, "Watch", watch)
+    feed.wish("page", [SLOT])
+    until(lambda: feed.problem == "out of luck")
+    until(lambda: feed.shown([SLOT]))
+    assert feed.problem == ""
+
+
+def test_the_moment_goes_on_while_nothing_that_is_shown_changes(cell, feed):
+    feed.wish("page", [SPEED_SLOT])
+    until(lambda: feed.shown([SPEED_SLOT]))
+    position = move(cell, 1.0)
+    until(lambda: feed.moment_ns == position.stamp_ns)
+
+
+def test_world_contexts_are_those_of_the_cell(cell):
+    """Empty ones too; of a dropped one nothing stays."""
+    with Viewer(cell, ViewSettings()) as viewer:
+        catalogue = viewer.feed.catalogue
+        assert catalogue.worlds() == ["online", "truth"]
+        cell.create_world("trial").init(ARM, SPEED, 0.5)
+        viewer.feed.wish("page", [])
+        viewer.list_for("page", [])
+        until(lambda: catalogue.slots("trial"))
+        cell.drop_world("trial")
+        until(lambda: catalogue.worlds() == ["online", "truth"])
+        assert catalogue.state(Slot("trial", "arm", "speed")) is None
+
+
+def test_an_unknown_world_context_is_refused_with_those_there_are(cell, tmp_path):
+    with pytest.raises(UnknownWorldError, match=r"'nosuch'.* \(it has online, truth\)"):
+        Viewer(cell, ViewSettings(world="nosuch"))
+    name, content = recording_of(CellSource(cell), "online", move(cell, 1.0).stamp_ns, SHOWS)
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(UnknownWorldError, match=r"'nosuch' \(it has online\)"):
+        Viewer(RecordingSource(tmp_path / name), ViewSettings(world="nosuch"))
+
+
 def test_the_past_is_exact_and_forgotten_data_are_named(cell, feed):
-    positions = [move(cell, x_m) for x_m in (1.0, 2.0, 3.0, 4.0)]
+    positions = [move(cell, float(x_m)) for x_m in range(1, 7)]
     feed.wish("page", [SLOT])
     until(lambda: feed.catalogue.slots("online") == [SLOT, SPEED_SLOT])
     contents = contents_of(cell, feed)
@@ -118,12 +186,19 @@ def test_the_past_is_exact_and_forgotten_data_are_named(cell, feed):
     contents.look_back([SLOT, SPEED_SLOT])
     timeline = contents.player.timeline
     assert len(timeline.stamps_ns) >= 3
-    contents.player.at_ns = positions[2].stamp_ns
+    contents.player.at_ns = positions[4].stamp_ns
     data = contents.data([SLOT, SPEED_SLOT])
-    assert data[SLOT].value[0, 3] == 3.0
+    assert data[SLOT].value[0, 3] == 5.0
     assert contents.data([SLOT, SPEED_SLOT])[SLOT] is data[SLOT]
-    contents.player.at_ns = positions[2].stamp_ns + 1
+    contents.player.at_ns = positions[4].stamp_ns + 1
     assert contents.data([SLOT, SPEED_SLOT])[SLOT] is data[SLOT]
+    assert contents.forgotten == ()
+    # Recent moments stay a while longer than their retention, until a later commit.
+    gone_ns, source = positions[0].stamp_ns, CellSource(cell)
+    until(lambda: move(cell, 7.0) and source.data_at([SLOT], gone_ns).forgotten)
+    contents.player.at_ns = gone_ns
+    assert contents.data([SLOT, SPEED_SLOT]).keys() == {SPEED_SLOT}
+    assert contents.forgotten == (SLOT,)
 
 
 def test_a_difference_is_coloured_and_labelled(cell, feed):
@@ -154,15 +229,19 @@ def test_a_difference_is_coloured_and_labelled(cell, feed):
     assert contents.comparing.right_tints() == {}
 
 
-def test_now_is_a_difference_that_is_made_again(cell, feed):
-    feed.wish("page", [SLOT])
-    until(lambda: feed.shown([SLOT]))
-    contents = contents_of(cell, feed)
-    contents.world, contents.comparing.against = "online", NOW
-    contents.comparing.look(
-        Side("online", feed.moment_ns), live=True, now_ns=feed.moment_ns, marked_ns=0
-    )
-    assert "0 differ" in contents.comparing.content
+def test_now_is_a_difference_that_is_made_again(cell, feed, monkeypatch):
+    """Once the present is a later one, and not before its time."""
+    comparing = contents_of(cell, feed).comparing
+    comparing.against, before = NOW, move(cell, 1.0)
+    left = Side("online", before.stamp_ns)
+    comparing.look(left, live=False, now_ns=before.stamp_ns, marked_ns=0)
+    assert "0 differ" in comparing.content
+    after = move(cell, 2.0)
+    comparing.look(left, live=False, now_ns=after.stamp_ns, marked_ns=0)
+    assert "0 differ" in comparing.content
+    monkeypatch.setattr("enact_dist.view.pages.comparing.AGAIN_S", 0.0)
+    comparing.look(left, live=False, now_ns=after.stamp_ns, marked_ns=0)
+    assert "1 differ" in comparing.content
 
 
 def test_causes_are_steps_and_a_label_keeps_them(cell, feed):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 from enact_dist.access.watch import Closing
 from enact_dist.config.shows import GUESSED
 from enact_dist.core.protocol.datum import Position
-from enact_dist.errors import MisuseError
+from enact_dist.errors import MisuseError, UnknownWorldError
 from enact_dist.view.activity import Activity, CellActivity
 from enact_dist.view.feed import Feed
 from enact_dist.view.recorded import RecordingFeed, RecordingSource
@@ -59,6 +59,10 @@ class Viewer(Closing):
         shown: An observer's connection, or a recording.
         settings: How it is shown.
 
+    Raises:
+        UnknownWorldError: It does not have the world context that pages are to begin with.
+        ShardUnreachableError: A shard that may know that one does not answer.
+
     Attributes:
         feed: The present.
         source: The past.
@@ -75,14 +79,23 @@ class Viewer(Closing):
         self.source: CellSource | RecordingSource
         self.cell: CellSource | None = None
         if isinstance(shown, RecordingSource):
+            known = shown.catalogue.worlds()
+            if self.world and self.world not in known:
+                raise UnknownWorldError(
+                    f"{shown.name} has no world context {self.world!r} (it has {', '.join(known)})",
+                    known=tuple(known),
+                )
             self.name, self.source, self.timeline = shown.name, shown, shown.timeline
             self.feed = RecordingFeed(shown, self._shows_of)
             return
+        if self.world:
+            shown.world(self.world)
         self.name, self.source = shown.name, CellSource(shown)
         self.cell = self.source
         self.feed = Feed(
             self.source, self._shows_of, rate_hz=settings.rate_hz, bytes_s=settings.bytes_s
         )
+        self.feed.catalogue.keep(self.source.session.client.worlds())
         self._activity = Activity(self.source, self.feed.catalogue)
         self.feed.start()
         self._activity.start()
