@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as nps
-from view_samples import shown, slot
+from view_samples import shown
 
 from enact_dist.errors import ConfigError
 from enact_dist.recording.drawing.solids import outer_voxels, voxel_faces
@@ -365,7 +365,3 @@ def test_named_fields_go_before_those_that_look_alike():
     cloud = shown({"normals": np.zeros((3, 3)), "points_m": corners}, "point_cloud")
     assert mesh.drawables["mesh"].triangles.tolist() == faces.tolist()
     assert cloud.drawables["point_cloud"].points_m.tolist() == corners.tolist()
-
-
-def test_slots_of_samples_are_named():
-    assert str(slot("a/b", "c")) == "online:a/b/c"
