@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
+import socket
 import threading
 import warnings
 from importlib.util import find_spec
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from enact_dist.access.watch import Closing
 from enact_dist.errors import ConfigError
@@ -17,6 +19,10 @@ if TYPE_CHECKING:
     from viser import ClientHandle
 
     from enact_dist.view.pages.viewer import Viewer
+
+
+PORTS_TRIED: Final = 1000
+PORT_MAX: Final = 65535
 
 
 def require_viser() -> None:
@@ -32,6 +38,50 @@ def require_viser() -> None:
         )
 
 
+def free_port(host: str, port: int) -> int:
+    """Return the port, or the next one that nothing listens on; 0 stays 0: any.
+
+    viser itself would try for ever, in a thread that its constructor waits for.
+
+    Raises:
+        ConfigError: There is none, or the host is no address of this machine.
+    """
+    taken: OSError | None = None
+    for tried in range(port, min(port + PORTS_TRIED, PORT_MAX + 1)):
+        try:
+            _bind(host, tried)
+        except OSError as error:
+            taken = error
+            if error.errno != errno.EADDRINUSE:
+                break
+        else:
+            return tried
+    raise ConfigError(
+        f"pages cannot be served at {host} port {port}: {taken}; choose with --host and --port"
+    ) from taken
+
+
+def _bind(host: str, port: int) -> None:
+    """Bind a port at each address of a host, as a server does, and leave it again."""
+    bound, absent = 0, OSError(errno.EADDRNOTAVAIL, "it has no address")
+    for family, kind, protocol, _, address in socket.getaddrinfo(
+        host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+    ):
+        with socket.socket(family, kind, protocol) as tried:
+            tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            if family == socket.AF_INET6:
+                tried.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+            try:
+                tried.bind(address)
+                bound += 1
+            except OSError as error:
+                if error.errno != errno.EADDRNOTAVAIL:
+                    raise
+                absent = error
+    if not bound:
+        raise absent
+
+
 class ViewServer(Closing):
     """The server of the pages; also a context manager.
 
@@ -41,11 +91,12 @@ class ViewServer(Closing):
         port: Port; the next free one if it is taken.
 
     Raises:
-        ConfigError: viser is not installed.
+        ConfigError: viser is not installed, or no port of the address can be listened on.
     """
 
     def __init__(self, viewer: Viewer, *, host: str = "127.0.0.1", port: int = 8080) -> None:
         require_viser()
+        port = free_port(host, port)
         from enact_dist.view.pages.unshared import UnsharedServer
 
         # A browser may go while its page draws: what is on its way then is no loss.
