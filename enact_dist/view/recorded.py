@@ -63,6 +63,11 @@ class RecordingSource:
         self.timeline = Timeline(ordered, begin_ns, begin_ns)
         self.catalogue.newest_ns = self.timeline.newest_ns
 
+    @property
+    def away(self) -> dict[str, str]:
+        """Nothing: there are no shards to ask."""
+        return {}
+
     def _moment(self, commit: RecordedCommit) -> int:
         """Return when a commit was; of what was there before, when the recording began."""
         begin_ns = int(self._recording.facts.get("begin_ns", "0") or 0)

@@ -48,6 +48,10 @@ class FoundData(NamedTuple):
 class DataSource(Protocol):
     """A cell, or a recording of one."""
 
+    @property
+    def away(self) -> dict[str, str]:
+        """Why shards are not asked now, by their names."""
+
     def data_at(
         self, slots: Sequence[Slot], at_ns: int, before: Mapping[Slot, Recorded] = {}
     ) -> FoundData:

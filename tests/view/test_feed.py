@@ -2,11 +2,11 @@
 
 import threading
 
-import numpy as np
 import pytest
+from view_samples import ARM, POSE, SHOWS, SLOT, SPEED, SPEED_SLOT, move, until
 
-from enact_dist import Aspect, Entity, Lock, Retention, Write, local
-from enact_dist.config.shows import GUESSED, Shows
+from enact_dist import Lock, Write
+from enact_dist.config.shows import GUESSED
 from enact_dist.core.protocol.datum import Slot
 from enact_dist.errors import UnknownWorldError
 from enact_dist.recording import Recorder
@@ -20,44 +20,6 @@ from enact_dist.view.pages.viewer import Viewer, ViewSettings
 from enact_dist.view.recorded import RecordingFeed, RecordingSource
 from enact_dist.view.source import CellSource
 from enact_dist.wire.payload import decode_untyped
-
-POSE = Aspect("pose", np.ndarray, retention=Retention(versions=3))
-SPEED = Aspect("speed", float)
-ARM = Entity("arm")
-SLOT, SPEED_SLOT = Slot("online", "arm", "pose"), Slot("online", "arm", "speed")
-SHOWS = {"pose": Shows(("pose",), frame="cell")}
-
-
-def moved(x_m):
-    matrix = np.eye(4)
-    matrix[0, 3] = x_m
-    return matrix
-
-
-def until(is_right):
-    """Wait until something holds that other threads bring about."""
-    pause = threading.Event()
-    for _ in range(2000):
-        if is_right():
-            return
-        pause.wait(0.01)
-    raise AssertionError("nothing came of it within 20 s")
-
-
-@pytest.fixture
-def cell():
-    with local(worlds=["online", "truth"], actor="writer") as cell:
-        online = cell.world("online")
-        online.init(ARM, SPEED, 0.5)
-        online.init(ARM, POSE, moved(0.0))
-        yield cell
-
-
-def move(cell, x_m, world="online"):
-    pose = Write(cell.world(world), ARM, POSE)
-    with Lock(pose) as lock:
-        lock[pose] = moved(x_m)
-    return lock.position
 
 
 @pytest.fixture

@@ -1,5 +1,10 @@
-"""Versions of data for the tests of the view, without a cell."""
+"""Data for the tests of the view: versions without a cell, and what they write into one."""
 
+import threading
+
+import numpy as np
+
+from enact_dist import Aspect, Entity, Lock, Retention, Write
 from enact_dist.config.shows import Shows
 from enact_dist.core.protocol.datum import Slot
 from enact_dist.recording.exact import Recorded
@@ -8,6 +13,35 @@ from enact_dist.wire.payload import encode_datum
 
 SECOND_NS = 1_000_000_000
 BEGIN_NS = 1_700_000_000 * SECOND_NS
+
+POSE = Aspect("pose", np.ndarray, retention=Retention(versions=3))
+SPEED = Aspect("speed", float)
+ARM = Entity("arm")
+SLOT, SPEED_SLOT = Slot("online", "arm", "pose"), Slot("online", "arm", "speed")
+SHOWS = {"pose": Shows(("pose",), frame="cell")}
+
+
+def moved(x_m):
+    matrix = np.eye(4)
+    matrix[0, 3] = x_m
+    return matrix
+
+
+def until(is_right):
+    """Wait until something holds that other threads bring about."""
+    pause = threading.Event()
+    for _ in range(2000):
+        if is_right():
+            return
+        pause.wait(0.01)
+    raise AssertionError("nothing came of it within 20 s")
+
+
+def move(cell, x_m, world="online"):
+    pose = Write(cell.world(world), ARM, POSE)
+    with Lock(pose) as lock:
+        lock[pose] = moved(x_m)
+    return lock.position
 
 
 def slot(entity, aspect="x", world="online"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING, Final, Protocol
 
 from enact_dist.view.drawing.scene import SceneView, ShownDatum, labels_of, scene_of, shown_of
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 
 SCENE_MAX: Final = 256
 """Most data in one scene."""
+HISTORY_S: Final = 5.0
+"""How often a page that follows the present asks how far the past reaches."""
 OTHERS_MAX: Final = 64
 """Most data of the right side of a difference that are drawn."""
 
@@ -66,6 +69,7 @@ class PageContents:
         comparing: The difference that is shown.
         forgotten: Data that have left their retention at the moment.
         left_out: Data that are not drawn because there are too many.
+        unfit: Which data of the moment cannot be shown, and why; "" of the present.
     """
 
     def __init__(
@@ -81,6 +85,9 @@ class PageContents:
         self.comparing = ShownDifference(compare)
         self.forgotten: tuple[Slot, ...] = ()
         self.left_out = 0
+        self.unfit = ""
+        self._history_due_s = 0.0
+        self._history_of: frozenset[Slot] = frozenset()
         self._trails = Trails()
         self._past: dict[Slot, ShownDatum] = {}
         self._past_key: tuple[object, ...] = ()
@@ -116,53 +123,74 @@ class PageContents:
         return [slot for slot in slots if slot.aspect == self.label][:SCENE_MAX]
 
     def look_back(self, slots: Sequence[Slot], at_ns: int = 0) -> None:
-        """Leave the present, for a moment (0: the newest one) of the history of some data.
-
-        Raises:
-            ShardUnreachableError: A shard does not answer.
-        """
+        """Leave the present, for a moment (0: the newest one) of the history of some data."""
         timeline = Timeline.of(self._source.histories(slots))
         self.player.look_back(timeline.including([at_ns]) if at_ns else timeline, at_ns)
+        self._trails = Trails()
+
+    def go_to(self, at_ns: int) -> None:
+        """Show another moment of the past; it does not play on from there."""
+        self.player.at_ns, self.player.playing = at_ns, False
+        self._trails = Trails()
+
+    def follow(self) -> None:
+        """Follow the present again."""
+        self.player.follow()
+        self._trails = Trails()
+        self._history_of = frozenset()
+
+    def learn_history(self, slots: Sequence[Slot]) -> None:
+        """Learn how far the past of some data reaches, unless that was asked a moment ago."""
+        begun_s, of = time.monotonic(), frozenset(slots)
+        if begun_s >= self._history_due_s + (HISTORY_S if of == self._history_of else 0.0):
+            self.player.timeline = Timeline.of(self._source.histories(slots))
+            self._history_of = of
+            self._history_due_s = begun_s + 20.0 * (time.monotonic() - begun_s)
 
     def data(self, slots: Sequence[Slot]) -> dict[Slot, ShownDatum]:
-        """Return data as of the moment.
+        """Return data as of the moment, of the shards that answer.
 
         Raises:
-            ShardUnreachableError: A shard does not answer.
+            LockTimeoutError: A commit before the moment is still undecided.
         """
         if self.player.live:
-            self.forgotten = ()
+            self.forgotten, self.unfit = (), ""
             return self._feed.shown(slots)
-        key = (self.player.at_ns, frozenset(slots))
+        key = (self.player.at_ns, frozenset(slots), frozenset(self._source.away))
         if key != self._past_key:
-            self._past, self.forgotten = self._as_of(slots, self.player.at_ns, self._past)
+            self._past, self.forgotten, self.unfit = self._as_of(
+                slots, self.player.at_ns, self._past
+            )
             self._past_key = key
         return self._past
 
     def _as_of(
         self, slots: Sequence[Slot], at_ns: int, before: dict[Slot, ShownDatum]
-    ) -> tuple[dict[Slot, ShownDatum], tuple[Slot, ...]]:
-        """Return data as of a moment; of a version that was shown before, the same object."""
-        found = self._source.data_at(slots, at_ns)
+    ) -> tuple[dict[Slot, ShownDatum], tuple[Slot, ...], str]:
+        """Return data as of a moment, what has left its retention, and what cannot be shown.
+
+        Of a version that was shown before, the same object is returned; it is not fetched again.
+        """
+        known = {slot: old.recorded for slot, old in before.items()}
+        found = self._source.data_at(slots, at_ns, known)
         shown: dict[Slot, ShownDatum] = {}
+        unfit = ""
         for slot, recorded in found.data.items():
-            old = before.get(slot)
-            same = old is not None and (old.recorded.version, old.recorded.stamp_ns) == (
-                recorded.version,
-                recorded.stamp_ns,
-            )
-            shown[slot] = (
-                old
-                if old is not None and same
-                else shown_of(recorded, self._feed.shows_of(slot.aspect))
-            )
-        return shown, found.forgotten
+            version = (recorded.version, recorded.stamp_ns)
+            if slot in known and (known[slot].version, known[slot].stamp_ns) == version:
+                shown[slot] = before[slot]
+                continue
+            try:
+                shown[slot] = shown_of(recorded, self._feed.shows_of(slot.aspect))
+            except Exception as error:  # noqa: BLE001 - one odd datum takes no other with it
+                unfit = f"{slot} v{recorded.version} cannot be shown: {error}"
+        return shown, found.forgotten, unfit
 
     def scenes(self, data: dict[Slot, ShownDatum]) -> dict[str, SceneView]:
         """Return the scene of the moment and, of a difference, what the other side has.
 
         Raises:
-            ShardUnreachableError: A shard does not answer.
+            LockTimeoutError: A commit before the moment is still undecided.
         """
         left = Side(self.world, self.at_ns)
         self.comparing.look(
@@ -184,7 +212,7 @@ class PageContents:
             key = (self.comparing.right, tuple(wanted))
             if key != self._others_key:
                 at_ns = self.comparing.right.at_ns
-                self._others, _ = self._as_of(wanted, at_ns, self._others)
+                self._others, _, _ = self._as_of(wanted, at_ns, self._others)
                 self._others_key = key
             scenes["right "] = scene_of(self._others, tints=others, frames_of=data)
         texts = self.comparing.texts() | {

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import queue
 import threading
 import time
 from collections import deque
 from typing import TYPE_CHECKING, Any, Final
 
-from enact_dist.errors import EnactError
 from enact_dist.view import markup
 from enact_dist.view.drawing.scene import extent_of
+from enact_dist.view.pages import texts
 from enact_dist.view.pages.canvas import Canvas
 from enact_dist.view.pages.comparing import MARKED, NOW
 from enact_dist.view.pages.contents import PageContents
 from enact_dist.view.pages.datum import SMALL_BYTES, Lineage, Samples, file_of, recording_of
 from enact_dist.view.pages.panels import CellPanel, DatumPanel, Text, TimePanel, TreePanel
-from enact_dist.world.trees import shown_s
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
     from enact_dist.view.catalogue import Listing
     from enact_dist.view.drawing.scene import SceneView, ShownDatum
     from enact_dist.view.pages.viewer import Viewer
+
+_log = logging.getLogger(__name__)
 
 LISTED_S: Final = 0.5
 """How often tables are made anew."""
@@ -51,7 +54,7 @@ class Page:
         self.contents = PageContents(viewer.feed, viewer.source, viewer.compare)
         self._canvas = Canvas(client)
         self._lineage, self._samples = Lineage(), Samples()
-        self._path = self._filter = self._said = ""
+        self._path = self._filter = self._said = self._failed = ""
         self._datum: Slot | None = None
         self._listing: Listing | None = None
         self._drawable: list[Slot] = []
@@ -78,10 +81,11 @@ class Page:
 
     def _run(self) -> None:
         try:
-            self._build()
+            if self._guarded(self._build):
+                return
             while not self._closed:
                 begun_s = time.monotonic()
-                self._guarded(self._tick)
+                self._failed = self._guarded(self._tick)
                 took_s = time.monotonic() - begun_s
                 # At most half of the time is spent here, however much there is to draw.
                 self._take_events(begun_s + max(1.0 / self._viewer.rate_hz, 2.0 * took_s))
@@ -102,16 +106,21 @@ class Page:
                 later = (other for other, _ in events[at + 1 :])
                 if name and not (name in newest and name in later):
                     self._said, self._listed_s = "", 0.0
-                    self._guarded(getattr(self, f"_on_{name.replace(' ', '_')}"), value)
-            self._guarded(self._tick)
+                    act = getattr(self, f"_on_{name.replace(' ', '_')}")
+                    self._said = self._guarded(act, value) or self._said
 
-    def _guarded(self, act: Any, *given: Any) -> None:
-        """Do something; what goes wrong is shown on the page."""
+    def _guarded(self, act: Any, *given: Any) -> str:
+        """Do something; show on the page what goes wrong, and return it."""
         try:
             act(*given)
-        except EnactError as error:
-            self._said = str(error)
-            self._show_status()
+        except Exception as error:  # noqa: BLE001 - the page goes on
+            wrong = str(error) or repr(error)
+            if wrong not in (self._said, self._failed):
+                _log.warning("the page goes on after: %s", wrong, exc_info=error)
+            with contextlib.suppress(Exception):  # the browser may have gone
+                self._show_status(wrong)
+            return wrong
+        return ""
 
     def _build(self) -> None:
         gui = self._client.gui
@@ -151,8 +160,10 @@ class Page:
         shown = {slot: data[slot] for slot in (*drawn, *labelled) if slot in data}
         whole = len(shown) >= len(drawn) or now_s > self._begun_s + FITTED_S
         self._draw(shown, fits=self._fits > (0 if whole else 1))
-        if not player.live:
-            self._time.range(player.timeline.span_s, player.timeline.seconds(player.at_ns))
+        if listing_due and player.live:
+            contents.learn_history(self._of_history())
+        line = player.timeline
+        self._time.range(line.span_s, line.span_s if player.live else line.seconds(player.at_ns))
         if listing_due:
             self._show_panels(data)
 
@@ -203,7 +214,11 @@ class Page:
     def _show_panels(self, data: Mapping[Slot, ShownDatum]) -> None:
         contents, player, listing = self.contents, self.contents.player, self._listing
         assert listing is not None
-        rows = [self._row(slot, data.get(slot)) for slot in listing.slots]
+        below = "" if self._filter else self._path
+        rows = [
+            texts.row_of(self._viewer, self._samples, slot, data.get(slot), below=below)
+            for slot in listing.slots
+        ]
         more = (
             f"<div>… and {listing.left_out} more: use the filter</div>" if listing.left_out else ""
         )
@@ -217,7 +232,8 @@ class Page:
         aspects = sorted({slot.aspect for slot in self._drawable})
         others = sorted({slot.aspect for slot in self._rows()} - set(aspects))
         self._tree.show_layers(aspects, others, contents.label)
-        self._detail.show(self._datum_content(data))
+        shown = data.get(self._datum) if self._datum is not None else None
+        self._detail.show(texts.datum_of(contents, self._samples, self._datum, shown))
         options = [*(() if player.live else (NOW,)), *((MARKED,) if contents.marked_ns else ())]
         others = [name for name in self._viewer.feed.catalogue.worlds() if name != contents.world]
         if self._viewer.cell is not None:
@@ -226,68 +242,12 @@ class Page:
             )
             now = self._viewer.activity_now()
             self._cell.show((now.locks, now.actors, now.shards))
-        self._time.show(markup.small(self._when()), live=player.live, playing=player.playing)
+        self._time.show(
+            markup.small(texts.moment_of(contents)), live=player.live, playing=player.playing
+        )
         self._show_status()
 
-    def _row(self, slot: Slot, shown: ShownDatum | None) -> str:
-        catalogue, now_s = self._viewer.feed.catalogue, time.monotonic()
-        entry, state = self._viewer.entry(slot), catalogue.state(slot)
-        name = markup.slot_name(slot).removeprefix("" if self._filter else self._path)
-        value = markup.text(markup.short_value(shown.value)) if shown is not None else ""
-        line = f"<b>{markup.text(name)}</b> {value} {markup.plot(self._samples.of(slot))}"
-        facts = [self._viewer.type_of(slot.aspect)]
-        if entry is not None:
-            facts.append(markup.size(entry.state.size))
-        rate_hz = catalogue.rate_hz(slot, now_s)
-        facts.append(f"{rate_hz:.3g} Hz" if rate_hz is not None else "")
-        if state is not None:
-            facts += [f"v{state.version}", markup.age(time.time_ns(), state.stamp_ns)]
-        if entry is not None and entry.cause is not None:
-            facts.append(f"by {entry.cause.actor or '(unnamed)'}")
-        held = self._viewer.activity_now().held.get(str(slot), "")
-        facts += [f"lock: {held}"] if held else []
-        under = markup.text(" · ".join(filter(None, facts)))
-        return f'<div style="margin-bottom:3px">{line}<div style="color:#888">{under}</div></div>'
-
-    def _datum_content(self, data: Mapping[Slot, ShownDatum]) -> str:
-        if self._datum is None:
-            return markup.small("choose a datum in the tab world")
-        head = f"<b>{markup.text(self._datum)}</b>"
-        shown = data.get(self._datum)
-        if shown is None:
-            known = self._datum in self.contents.forgotten
-            why = (
-                "has left its retention at this moment" if known else "is not there at this moment"
-            )
-            return markup.small(f"{head} {why}")
-        recorded = shown.recorded
-        parts = [f"v{recorded.version}", markup.clock(recorded.stamp_ns)]
-        if recorded.captured_ns:
-            parts.append(f"captured {markup.clock(recorded.captured_ns)}")
-        if recorded.null_reason:
-            parts.append(f"null: {recorded.null_reason}")
-        until_ns = 0 if self.contents.player.live else self.contents.player.at_ns
-        plot = markup.big_plot(self._samples.of(self._datum, until_ns))
-        facts = markup.text(" · ".join(parts))
-        return markup.small(f"{head}<div>{facts}</div>{markup.whole_value(shown.value)}") + plot
-
-    def _when(self) -> str:
-        contents, player = self.contents, self.contents.player
-        at = markup.clock(contents.at_ns) if contents.at_ns else "no commit yet"
-        if player.live:
-            return f"<b>now</b>, {at}"
-        line = player.timeline
-        parts = [f"<b>{at}</b>, {shown_s((line.newest_ns - player.at_ns) / 1e9)} before the newest"]
-        parts.append(f"history from {markup.clock(line.oldest_ns)}, {len(line.stamps_ns)} commits")
-        if line.whole_ns > line.oldest_ns:
-            parts.append(f"all data from {markup.clock(line.whole_ns)} on")
-        if contents.forgotten:
-            names = ", ".join(map(markup.slot_name, contents.forgotten[:4]))
-            more = ", …" if contents.forgotten[4:] else ""
-            parts.append(f"{len(contents.forgotten)} data have left their retention: {names}{more}")
-        return "<br>".join(markup.text(part) if "<b>" not in part else part for part in parts)
-
-    def _show_status(self) -> None:
+    def _show_status(self, wrong_now: str = "") -> None:
         feed, contents = self._viewer.feed, self.contents
         rate_hz = len(self._draws) / RATE_WINDOW_S
         parts = [f"{self._viewer.name} · {contents.world} · {rate_hz:.1f} updates/s"]
@@ -298,7 +258,7 @@ class Page:
         if contents.left_out:
             parts.append(f"{contents.left_out} data not drawn: too many, switch layers off")
         lines = [markup.text(part) for part in (*parts, *self._remarks[:5])]
-        wrong = [one for one in (feed.problem, self._said) if one]
+        wrong = dict.fromkeys(filter(None, (feed.problem, contents.unfit, self._said, wrong_now)))
         lines += [f'<span style="color:#b00">{markup.text(one)}</span>' for one in wrong]
         self._status.show(markup.small("<br>".join([*lines, "&nbsp;"])))
 
@@ -342,22 +302,28 @@ class Page:
 
     def _on_live(self, wanted: bool) -> None:
         if wanted:
-            self.contents.player.follow()
+            self.contents.follow()
         else:
             self._look_back()
 
     def _look_back(self, at_ns: int = 0) -> None:
+        self.contents.look_back(self._of_history(), at_ns)
+
+    def _of_history(self) -> list[Slot]:
         slots = [*self.contents.drawn(self._drawable), *self._followed()]
-        self.contents.look_back(list(dict.fromkeys(slots)), at_ns)
+        return list(dict.fromkeys(slots))
 
     def _past(self) -> None:
         if self.contents.player.live:
             self._look_back()
 
     def _on_seconds(self, seconds: float) -> None:
-        self._past()
         player = self.contents.player
-        player.at_ns, player.playing = player.timeline.at(seconds), False
+        if player.live:  # its right end is the present, which has gone on since the slider was set
+            back_s = self._time.high_s - seconds
+            self._look_back()
+            seconds = player.timeline.span_s - back_s
+        self.contents.go_to(player.timeline.at(seconds))
 
     def _on_step(self, by: int) -> None:
         self._past()

@@ -14,9 +14,8 @@ if TYPE_CHECKING:
     """Takes the name of an event and its value; returns at once."""
 
 NONE: Final = "-"
-"""ShownDatum where nothing is chosen."""
+"""The option of a list that stands for no choice."""
 SPEEDS: Final = ("0.1", "0.25", "0.5", "1", "2", "5", "10")
-BRANCHES_MAX: Final = 30
 
 
 def listen(handle: Any, send: Events, name: str) -> None:
@@ -91,6 +90,11 @@ class TimePanel:
         self._where.show(where)
         put(self._live, live)
         put(self._playing, playing)
+
+    @property
+    def high_s(self) -> float:
+        """The right end of the slider: seconds after its left end."""
+        return float(self._slider.max)
 
     def range(self, span_s: float, seconds: float) -> None:
         """Show how far back the slider goes, and where it is."""

@@ -1,0 +1,89 @@
+"""What a page says in words: of a listed datum, of the chosen one, of the moment."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+from enact_dist.view import markup
+from enact_dist.world.trees import shown_s
+
+if TYPE_CHECKING:
+    from enact_dist.core.protocol.datum import Slot
+    from enact_dist.view.drawing.scene import ShownDatum
+    from enact_dist.view.pages.contents import PageContents
+    from enact_dist.view.pages.datum import Samples
+    from enact_dist.view.pages.viewer import Viewer
+
+
+def row_of(
+    viewer: Viewer, samples: Samples, slot: Slot, shown: ShownDatum | None, *, below: str
+) -> str:
+    """Return a listed datum as HTML.
+
+    Args:
+        viewer: What is known of it.
+        samples: Its numbers.
+        slot: Its slot.
+        shown: Its value, None if that has not come.
+        below: The path that its name is shown without.
+    """
+    catalogue, now_s = viewer.feed.catalogue, time.monotonic()
+    entry, state = viewer.entry(slot), catalogue.state(slot)
+    name = markup.slot_name(slot).removeprefix(below)
+    value = markup.text(markup.short_value(shown.value)) if shown is not None else ""
+    line = f"<b>{markup.text(name)}</b> {value} {markup.plot(samples.of(slot))}"
+    facts = [viewer.type_of(slot.aspect)]
+    if entry is not None:
+        facts.append(markup.size(entry.state.size))
+    rate_hz = catalogue.rate_hz(slot, now_s)
+    facts.append(f"{rate_hz:.3g} Hz" if rate_hz is not None else "")
+    if state is not None:
+        facts += [f"v{state.version}", markup.age(time.time_ns(), state.stamp_ns)]
+    if entry is not None and entry.cause is not None:
+        facts.append(f"by {entry.cause.actor or '(unnamed)'}")
+    held = viewer.activity_now().held.get(str(slot), "")
+    facts += [f"lock: {held}"] if held else []
+    under = markup.text(" · ".join(filter(None, facts)))
+    return f'<div style="margin-bottom:3px">{line}<div style="color:#888">{under}</div></div>'
+
+
+def datum_of(
+    contents: PageContents, samples: Samples, slot: Slot | None, shown: ShownDatum | None
+) -> str:
+    """Return the chosen datum in full as HTML, or why it is not there."""
+    if slot is None:
+        return markup.small("choose a datum in the tab world")
+    head = f"<b>{markup.text(slot)}</b>"
+    if shown is None:
+        gone = slot in contents.forgotten
+        why = "has left its retention at this moment" if gone else "is not there at this moment"
+        return markup.small(f"{head} {why}")
+    recorded = shown.recorded
+    parts = [f"v{recorded.version}", markup.clock(recorded.stamp_ns)]
+    if recorded.captured_ns:
+        parts.append(f"captured {markup.clock(recorded.captured_ns)}")
+    if recorded.null_reason:
+        parts.append(f"null: {recorded.null_reason}")
+    until_ns = 0 if contents.player.live else contents.player.at_ns
+    plot = markup.big_plot(samples.of(slot, until_ns))
+    facts = markup.text(" · ".join(parts))
+    return markup.small(f"{head}<div>{facts}</div>{markup.whole_value(shown.value)}") + plot
+
+
+def moment_of(contents: PageContents) -> str:
+    """Return as HTML which moment a page shows, and what is missing of it."""
+    player = contents.player
+    at = markup.clock(contents.at_ns) if contents.at_ns else "no commit yet"
+    if player.live:
+        return f"<b>now</b>, {at}"
+    line = player.timeline
+    parts = [f"<b>{at}</b>, {shown_s((line.newest_ns - player.at_ns) / 1e9)} before the newest"]
+    parts.append(f"history from {markup.clock(line.oldest_ns)}, {len(line.stamps_ns)} commits")
+    if line.whole_ns > line.oldest_ns:
+        parts.append(f"all data from {markup.clock(line.whole_ns)} on")
+    if contents.forgotten:
+        names = ", ".join(map(markup.slot_name, contents.forgotten[:4]))
+        more = ", …" if contents.forgotten[4:] else ""
+        parts.append(f"{len(contents.forgotten)} data have left their retention: {names}{more}")
+    return "<br>".join(markup.text(part) if "<b>" not in part else part for part in parts)

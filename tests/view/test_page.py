@@ -1,0 +1,104 @@
+"""A page and its server, without a browser: its thread, its bounds, its moments."""
+
+import socket
+import time
+
+import pytest
+from quiet_browser import QuietClient
+from view_samples import SHOWS, move, moved, shown, slot, until
+
+from enact_dist.errors import ConfigError
+from enact_dist.view.pages.page import Page
+from enact_dist.view.pages.server import free_port
+from enact_dist.view.pages.viewer import Viewer, ViewSettings
+
+
+@pytest.fixture
+def page(cell):
+    with Viewer(cell, ViewSettings(SHOWS, "online", rate_hz=20.0)) as viewer:
+        page = Page(viewer, QuietClient())
+        yield page
+        page.close()
+        if page._thread.ident:
+            page._thread.join()
+
+
+def test_a_page_outlives_what_its_tick_and_its_events_raise(page, monkeypatch):
+    """It says so as long as it is so; an event's failure stays until the next event."""
+    tick, failing = page._tick, [True]
+
+    def odd():
+        if failing[0]:
+            raise ZeroDivisionError("no scale")
+        tick()
+
+    monkeypatch.setattr(page, "_tick", odd)
+    monkeypatch.setattr(page, "_on_fit", lambda _: 1 / 0)
+    page.start()
+    client = page._client
+    until(lambda: "no scale" in client.status())
+    failing[0] = False
+    until(lambda: "updates/s" in client.status() and "no scale" not in client.status())
+    page._send("fit", None)
+    until(lambda: "division by zero" in client.status())
+    assert page._thread.is_alive()
+
+
+def test_events_are_taken_at_once_and_ticks_in_their_time(page, monkeypatch):
+    """However much a person does, the rate bounds what is drawn."""
+    ticks, taken = [], []
+    monkeypatch.setattr(page, "_tick", lambda: ticks.append(1))
+    monkeypatch.setattr(page, "_on_fit", taken.append)
+    for number in range(3):
+        page._send("fit", number)
+        page._take_events(time.monotonic() + 0.01)
+        assert taken == list(range(number + 1))
+    assert ticks == []
+
+
+def test_the_slider_reaches_from_the_oldest_moment_to_the_present(page, cell):
+    """While the page is live, too: at its right end it shows the newest moment."""
+    positions = [move(cell, x_m) for x_m in (1.0, 2.0)]
+    page.start()
+    slider = page._client.gui.handles
+    until(lambda: "seconds" in slider and slider["seconds"].value == slider["seconds"].max != 1.0)
+    line = page.contents.player.timeline
+    assert slider["seconds"].max == pytest.approx(line.span_s, abs=1e-3)
+    page._send("seconds", slider["seconds"].max)
+    until(lambda: not page.contents.player.live)
+    until(lambda: page.contents.at_ns == positions[-1].stamp_ns)
+
+
+def test_a_jump_leaves_no_trail(page):
+    """From the past back to the present the places between were never seen."""
+    contents = page.contents
+
+    def trails_at(x_m, version):
+        pose = shown(moved(x_m), "pose", frame="cell", version=version)
+        scene = contents.scenes({slot("thing"): pose})[""]
+        return [name for name in scene.nodes if name.startswith("trail")]
+
+    assert trails_at(0.0, 1) == []
+    assert len(trails_at(1.0, 2)) == 1
+    contents.player.look_back(contents.player.timeline)
+    contents.follow()
+    assert trails_at(9.0, 3) == []
+    contents.go_to(contents.at_ns)
+    assert trails_at(5.0, 4) == []
+
+
+def test_a_taken_port_is_followed_by_the_next(page):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert free_port("127.0.0.1", port) > port
+
+
+def test_an_address_that_cannot_be_listened_on_is_refused(monkeypatch):
+    """Of another machine, or with its last port taken; viser would wait for ever."""
+    with pytest.raises(ConfigError, match=r"192\.0\.2\.1 port 8080: .*assign"):
+        free_port("192.0.2.1", 8080)
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        monkeypatch.setattr("enact_dist.view.pages.server.PORT_MAX", port)
+        with pytest.raises(ConfigError, match=rf"127\.0\.0\.1 port {port}: .*in use"):
+            free_port("127.0.0.1", port)
