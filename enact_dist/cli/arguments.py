@@ -32,15 +32,20 @@ def duration(text: str) -> float:
     return 0.0 if text.strip() in {"0", "0.0"} else seconds(text)
 
 
-def seconds(text: str) -> float:
-    """Read a positive number of seconds; an `argparse` type."""
+def above_zero(text: str, what: str = "number") -> float:
+    """Read a positive number; an `argparse` type."""
     try:
         value = float(text)
     except ValueError:
         value = 0.0
     if not 0.0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is no number of seconds above zero")
+        raise argparse.ArgumentTypeError(f"{text!r} is no {what} above zero")
     return value
+
+
+def seconds(text: str) -> float:
+    """Read a positive number of seconds; an `argparse` type."""
+    return above_zero(text, "number of seconds")
 
 
 @in_words()

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from enact_dist.cli.arguments import CELL_NAMED, TIMEOUT, pair, seconds
+from enact_dist.cli.arguments import CELL_NAMED, TIMEOUT, above_zero, pair
 from enact_dist.cli.record import shows_of
 from enact_dist.cli.target import cell_target, open_cell
 from enact_dist.cli.verbs import DONE, NOUNS, Verb, many, option
@@ -53,9 +53,9 @@ VERBS: Final = (
             many("--shows", "ASPECT=KIND",
                  "as in enact record (default: as the cell.toml says, else guessed)", type=pair),
             option("--rate", "HZ", "most updates of a page per second (default: 10)",
-                   type=seconds, default=10.0),
-            option("--bytes", "MB", "most megabytes fetched from the cell per second"
-                   " (default: 150)", dest="megabytes_s", type=seconds, default=150.0),
+                   type=above_zero, default=10.0),
+            option("--bytes", "MB", "most megabytes per second that are fetched of the present"
+                   " (default: 150)", dest="megabytes_s", type=above_zero, default=150.0),
             TIMEOUT,
         ),
         defaults={"timeout_s": ANSWER_S},

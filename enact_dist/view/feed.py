@@ -81,6 +81,7 @@ class Feed:
         self.moment_ns = 0
         self._kinds: dict[str, frozenset[str]] = {}
         self._shown: dict[Slot, ShownDatum] = {}
+        self._sizes: dict[Slot, int] = {}
         self._wishes: dict[object, frozenset[Slot]] = {}
         self._budget, self._budget_s = bytes_s, time.monotonic()
         self._news = threading.Condition()
@@ -185,11 +186,16 @@ class Feed:
         changed = [slot for slot in wanted if self._is_new(slot)]
         away = self._source.still_away()
         asked = [s for s in {*changed, *probes} if self._source.shard_of(s) not in away]
-        affordable = self._affordable(asked, now_s)
-        if affordable:
-            self._fetch(affordable)
-        elif not asked:  # what is shown is of this moment, too
+        if not asked:  # what is shown is of this moment, too
             self.moment_ns = self.catalogue.newest_ns
+            return
+        try:
+            affordable = self._affordable(asked, now_s)
+            if affordable:
+                self._fetch(affordable)
+            self._trouble = ""
+        except EnactError as error:
+            self._trouble = str(error)
 
     def _is_new(self, slot: Slot) -> bool:
         state, shown = self.catalogue.state(slot), self._shown.get(slot)
@@ -208,10 +214,12 @@ class Feed:
         return list(found.values())
 
     def _affordable(self, slots: list[Slot], now_s: float) -> list[Slot]:
-        """Return the slots for which the limit of bytes has room; a datum's size is its last one.
+        """Return the slots for which the limit of bytes has room.
 
+        A datum is taken to be as large as its last fetched version, a new one as its shard says.
         Those that were fetched longest ago come first, so that each has its turn.
         """
+        self._learn_sizes([slot for slot in slots if slot not in self._sizes])
         self._budget = min(self._bytes_s, self._budget + self._bytes_s * (now_s - self._budget_s))
         self._budget_s = now_s
         found = []
@@ -219,10 +227,16 @@ class Feed:
             if self._budget <= 0.0:
                 self.held_back += 1
                 break
-            shown = self._shown.get(slot)
-            self._budget -= shown.recorded.size if shown is not None else 0
+            self._budget -= self._sizes.get(slot, 0)
             found.append(slot)
         return found
+
+    def _learn_sizes(self, slots: list[Slot]) -> None:
+        states = {slot: self.catalogue.state(slot) for slot in slots}
+        asked = {slot: state.version for slot, state in states.items() if state is not None}
+        if asked:
+            for slot, entry in self._source.explained(asked).items():
+                self._sizes[slot] = entry.state.size
 
     def _fetched_ns(self, slot: Slot) -> int:
         shown = self._shown.get(slot)
@@ -230,14 +244,11 @@ class Feed:
 
     def _fetch(self, slots: list[Slot]) -> None:
         at_ns = self.catalogue.newest_ns
-        try:
-            found = self._source.data_at(slots, at_ns)
-        except EnactError as error:
-            self._trouble = str(error)
-            return
-        self._trouble = ""
+        found = self._source.data_at(slots, at_ns)
         with self._news:
             for slot, recorded in found.data.items():
+                self._budget += self._sizes.get(slot, 0) - recorded.size
+                self._sizes[slot] = recorded.size
                 self._show(slot, recorded)
             self.moment_ns = at_ns
             self._news.notify_all()

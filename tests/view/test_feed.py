@@ -2,10 +2,12 @@
 
 import threading
 
+import numpy as np
 import pytest
 from view_samples import ARM, POSE, SHOWS, SLOT, SPEED, SPEED_SLOT, move, until
 
-from enact_dist import Lock, Write
+from enact_dist import Entity, Lock, Write
+from enact_dist.access.snapshot import HeldView
 from enact_dist.config.shows import GUESSED
 from enact_dist.core.protocol.datum import Slot
 from enact_dist.errors import UnknownWorldError
@@ -71,6 +73,38 @@ def test_passed_over_versions_and_bytes_are_counted(cell):
         assert slow.passed_over + slow.held_back > 0
     finally:
         slow.stop()
+
+
+def test_a_datum_counts_for_the_limit_of_bytes_before_it_was_ever_shown(cell):
+    """Its shard knows its size: not all large data come at once when a page opens."""
+    slots = [Slot("online", f"part/{number}", "pose") for number in range(4)]
+    for slot in slots:
+        cell.world("online").init(Entity(slot.entity), POSE, np.zeros((100, 100)))
+    slow = Feed(CellSource(cell), lambda _: SHOWS["pose"], rate_hz=50.0, bytes_s=4000.0)
+    slow.start()
+    try:
+        slow.wish("page", slots)
+        until(lambda: slow.held_back)
+        assert len(slow.shown(slots)) == 1
+    finally:
+        slow.stop()
+
+
+def test_what_the_past_has_shown_is_not_fetched_again(cell, monkeypatch):
+    position, source, fetched = move(cell, 1.0), CellSource(cell), []
+    fetch = HeldView.fetch
+
+    def counted(view, readings):
+        fetched.append(len([*readings]))
+        return fetch(view, readings)
+
+    monkeypatch.setattr(HeldView, "fetch", counted)
+    found = source.data_at([SLOT, SPEED_SLOT], position.stamp_ns).data
+    after = move(cell, 2.0)
+    again = source.data_at([SLOT, SPEED_SLOT], after.stamp_ns, found).data
+    assert fetched == [2, 1]
+    assert again[SPEED_SLOT] is found[SPEED_SLOT]
+    assert decode_untyped(again[SLOT].datum)[0, 3] == 2.0
 
 
 def test_an_odd_datum_is_named_and_takes_no_other_with_it(cell, feed, monkeypatch):

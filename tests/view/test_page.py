@@ -7,6 +7,7 @@ import pytest
 from quiet_browser import QuietClient
 from view_samples import SHOWS, move, moved, shown, slot, until
 
+from enact_dist.cli.main import main
 from enact_dist.errors import ConfigError
 from enact_dist.view.pages.page import Page
 from enact_dist.view.pages.server import free_port
@@ -102,3 +103,10 @@ def test_an_address_that_cannot_be_listened_on_is_refused(monkeypatch):
         monkeypatch.setattr("enact_dist.view.pages.server.PORT_MAX", port)
         with pytest.raises(ConfigError, match=rf"127\.0\.0\.1 port {port}: .*in use"):
             free_port("127.0.0.1", port)
+
+
+@pytest.mark.parametrize("option", ["--rate", "--bytes"])
+def test_a_bound_of_zero_is_refused_in_its_own_words(option, capsys):
+    with pytest.raises(SystemExit):
+        main(["view", "cell.toml", option, "0"])
+    assert f"argument {option}: '0' is no number above zero" in capsys.readouterr().err
