@@ -5,6 +5,7 @@ Only the state of one moment is in memory.  To go back, the file is read again f
 
 from __future__ import annotations
 
+import copy
 import threading
 from typing import TYPE_CHECKING
 
@@ -44,14 +45,9 @@ class RecordingSource:
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        self._recording = Recording(path)
+        self._begin(Recording(path))
         self.name = self._recording.path.name
         self.catalogue = SlotCatalogue()
-        self._guard = threading.Lock()
-        self._state: dict[Slot, Recorded] = {}
-        self._commits: Iterator[RecordedCommit] = iter(())
-        self._ahead: RecordedCommit | None = None
-        self._at_ns = -1
         stamps: set[int] = set()
         for commit in self._recording.commits():
             for one in commit.versions:
@@ -62,6 +58,20 @@ class RecordingSource:
         begin_ns = ordered[0] if ordered else 0
         self.timeline = Timeline(ordered, begin_ns, begin_ns)
         self.catalogue.newest_ns = self.timeline.newest_ns
+
+    def _begin(self, recording: Recording) -> None:
+        self._recording = recording
+        self._guard = threading.Lock()
+        self._state: dict[Slot, Recorded] = {}
+        self._commits: Iterator[RecordedCommit] = iter(())
+        self._ahead: RecordedCommit | None = None
+        self._at_ns = -1
+
+    def of_page(self) -> RecordingSource:
+        """Return the recording with a moment of its own: no page reads the file for another."""
+        source = copy.copy(self)
+        source._begin(Recording(self._recording.path))  # noqa: SLF001 - of the same class
+        return source
 
     @property
     def away(self) -> dict[str, str]:

@@ -48,6 +48,9 @@ class FoundData(NamedTuple):
 class DataSource(Protocol):
     """A cell, or a recording of one."""
 
+    def of_page(self) -> DataSource:
+        """Return the source for one page."""
+
     @property
     def away(self) -> dict[str, str]:
         """Why shards are not asked now, by their names."""
@@ -75,6 +78,10 @@ class CellSource:
         self.cell = cell
         self.session = cell._session  # noqa: SLF001 - a handle of a world context asks all shards
         self._away: dict[str, tuple[float, str]] = {}
+
+    def of_page(self) -> CellSource:
+        """Return this one: all pages share it."""
+        return self
 
     # ------------------------------------------------------------ shards
 

@@ -234,7 +234,7 @@ def test_two_pages_show_two_moments_and_outlive_their_shard(page, shown, browser
     shown.shard.kill()
     shown.shard.wait(60)
     other.tab("cell")
-    other.text("UNREACHABLE")
+    other.text("AWAY")
     shown.shard = shown.start_shard()
     shown.move(3.0)
     shown.move(0.0)

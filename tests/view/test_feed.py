@@ -12,6 +12,7 @@ from enact_dist.config.shows import GUESSED
 from enact_dist.core.protocol.datum import Slot
 from enact_dist.errors import UnknownWorldError
 from enact_dist.recording import Recorder
+from enact_dist.recording.reading import Recording
 from enact_dist.view import feed as feeds
 from enact_dist.view.activity import Activity
 from enact_dist.view.feed import Feed
@@ -311,3 +312,18 @@ def test_a_recording_is_a_past(cell, tmp_path):
         contents = PageContents(feed, source, lambda *_: None)
         contents.player.look_back(source.timeline, position.stamp_ns)
         assert contents.data([SLOT])[SLOT].value[0, 3] == x_m
+
+
+def test_no_page_reads_a_recording_again_for_another(cell, tmp_path, monkeypatch):
+    """Each goes through the file by itself, so that only its own steps back read it again."""
+    stamp_ns = move(cell, 1.0).stamp_ns
+    name, content = recording_of(CellSource(cell), "online", stamp_ns, SHOWS)
+    (tmp_path / name).write_bytes(content)
+    source = RecordingSource(tmp_path / name)
+    one, other = source.of_page(), source.of_page()
+    begun, commits = [], Recording.commits
+    monkeypatch.setattr(Recording, "commits", lambda file: begun.append(1) or commits(file))
+    for _ in range(3):
+        assert one.data_at([SLOT], source.timeline.newest_ns).data.keys() == {SLOT}
+        assert not other.data_at([SLOT], source.timeline.newest_ns - 1).data
+    assert len(begun) == 2

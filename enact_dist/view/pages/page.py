@@ -51,7 +51,7 @@ class Page:
         self._viewer, self._client = viewer, client
         self._events: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
         self._closed = False
-        self.contents = PageContents(viewer.feed, viewer.source, viewer.compare)
+        self.contents = PageContents(viewer.feed, viewer.source.of_page(), viewer.compare)
         self._canvas = Canvas(client)
         self._lineage, self._samples = Lineage(), Samples()
         self._path = self._filter = self._said = self._failed = ""
