@@ -10,6 +10,7 @@ from enact_dist.access.asking import answers_to, explained, in_parts
 from enact_dist.access.snapshot import HeldView
 from enact_dist.core.protocol.messages import Item, ListHistory, Ping, SlotVersion, Versions
 from enact_dist.errors import ForgottenError, LeaseLostError, LinkError, ShardUnreachableError
+from enact_dist.link.client.calls import CALL_S
 from enact_dist.recording.exact import Recorded
 from enact_dist.terms import Access
 
@@ -115,8 +116,14 @@ class CellSource:
         """Learn the aspects and world contexts of the shards that answer; return the contexts."""
         client, away = self.session.client, self.still_away()
         asked = [shard for shard in client.shards() if shard not in away]
-        client.call_once([(shard, client.core.hello(shard)) for shard in asked])
+        answers = client.call_once([(shard, client.core.hello(shard)) for shard in asked])
+        for shard, answer in zip(asked, answers, strict=True):
+            if answer is None and not self._is_there(shard):
+                self._miss(shard, client.unreachable(shard, CALL_S))
         return sorted(client.worlds())
+
+    def _miss(self, shard: str, error: ShardUnreachableError) -> None:
+        self._away[shard] = (time.monotonic() + AGAIN_S, str(error))
 
     def _of_those_there(self, slots: Iterable[Slot], ask: Callable[[list[Slot]], T]) -> T:
         """Ask for slots; without those of a shard that does not answer, if there is one."""
@@ -129,7 +136,7 @@ class CellSource:
                 fewer = [slot for slot in left if self.shard_of(slot) != error.shard]
                 if len(fewer) == len(left):
                     raise
-                self._away[error.shard] = (time.monotonic() + AGAIN_S, str(error))
+                self._miss(error.shard, error)
                 left = fewer
 
     # ------------------------------------------------------------ data
