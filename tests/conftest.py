@@ -21,7 +21,9 @@ sys.path.insert(0, str(Path(__file__).parent))
 import carriers
 import ports
 
-HALVED = [Path(__file__).parent / name for name in ("actors", "bench", "cli", "recording", "verify")]
+HALVED = [
+    Path(__file__).parent / name for name in ("actors", "bench", "cli", "recording", "verify")
+]
 """Of the tests of applications and tools each run takes half of the files of a folder.
 
 Of the files with other slow tests it takes the slow ones of every second.

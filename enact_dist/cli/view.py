@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from enact_dist.cli.arguments import CELL_NAMED, TIMEOUT, above_zero, pair
+from enact_dist.cli.arguments import CELL_NAMED, above_zero, pair, seconds_of
 from enact_dist.cli.record import shows_of
 from enact_dist.cli.target import cell_target, open_cell
 from enact_dist.cli.verbs import DONE, NOUNS, Verb, many, option
@@ -56,9 +56,9 @@ VERBS: Final = (
                    type=above_zero, default=10.0),
             option("--bytes", "MB", "most megabytes per second that are fetched of the present"
                    " (default: 150)", dest="megabytes_s", type=above_zero, default=150.0),
-            TIMEOUT,
+            seconds_of("--timeout", "how long a shard may take to answer (default: 2)", ANSWER_S,
+                       dest="timeout_s"),
         ),
-        defaults={"timeout_s": ANSWER_S},
     ),
 )  # fmt: skip
 
