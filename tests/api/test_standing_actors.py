@@ -178,8 +178,12 @@ def test_lock_that_is_refused_is_asked_for_ever_more_rarely(cell, online):
     actor, errors = Segmenter(), queue.Queue()
     put(extra, 1)
     report = lambda _entity, error: errors.put((time.monotonic(), error))  # noqa: E731
-    with ActorThread(actor, cell, {"online": "extra"}, on_error=report):
+    with (
+        extra.watch(CAMERA, MASK) as masks,
+        ActorThread(actor, cell, {"online": "extra"}, on_error=report),
+    ):
         assert actor.saw.get(timeout=PATIENCE_S) == 1
+        assert masks.next(PATIENCE_S).version == 1  # its lock has ended with that commit
         cell.drop_world("extra")
         (first_s, error), (last_s, _) = [errors.get(timeout=PATIENCE_S) for _ in range(4)][::3]
     assert isinstance(error, UnknownWorldError)
