@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import re
-import threading
 import time
 from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -17,6 +16,7 @@ from enact_dist.cli.top.tables import TABLES
 from enact_dist.errors import EnactError
 from enact_dist.operate.cell_rates import Looks, pause_s
 from enact_dist.view import markup
+from enact_dist.view.follower import Follower
 from enact_dist.world.trees import shown_s
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ class CellActivity(NamedTuple):
     held: Mapping[str, str] = {}
 
 
-class Activity:
+class Activity(Follower):
     """The thread that asks.
 
     Args:
@@ -61,27 +61,13 @@ class Activity:
     """
 
     def __init__(self, source: CellSource, catalogue: SlotCatalogue) -> None:
+        super().__init__("view activity")
         self._source, self._catalogue = source, catalogue
         self.now = CellActivity()
         self._entries: dict[Slot, VersionEntry] = {}
         self._types: dict[str, str] = {}
         self._listed: dict[object, frozenset[Slot]] = {}
         self._looks = Looks()
-        self._news = threading.Condition()
-        self._stopped = False
-        self._thread = threading.Thread(target=self._run, name="view activity", daemon=True)
-
-    def start(self) -> None:
-        """Begin."""
-        self._thread.start()
-
-    def stop(self) -> None:
-        """End; twice is harmless."""
-        with self._news:
-            self._stopped = True
-            self._news.notify_all()
-        if self._thread.ident is not None:
-            self._thread.join()
 
     def list(self, page: object, slots: Iterable[Slot] | None) -> None:
         """Set which slots a page lists; None: the page has gone."""
@@ -109,11 +95,10 @@ class Activity:
                     return
                 listed = self._listed.copy()
             begun_s = time.monotonic()
-            for ask in (partial(self._explain, frozenset().union(*listed.values())), self._ask):
+            explain = partial(self._explain, frozenset().union(*listed.values()))
+            for ask in (explain, self._ask, self._refresh):
                 with contextlib.suppress(EnactError):
                     ask()
-            with contextlib.suppress(EnactError):
-                self._refresh()
             left_s = pause_s(EVERY_S, time.monotonic() - begun_s)
             with self._news:
                 self._news.wait_for(partial(self._is_over, listed), left_s)

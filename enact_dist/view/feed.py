@@ -6,7 +6,6 @@ newest version is fetched, and no more bytes than the limit; what is passed over
 
 from __future__ import annotations
 
-import threading
 import time
 from typing import TYPE_CHECKING, Final
 
@@ -15,6 +14,7 @@ from enact_dist.core.protocol.datum import Slot
 from enact_dist.errors import EnactError
 from enact_dist.view.catalogue import ListedState, SlotCatalogue
 from enact_dist.view.drawing.scene import IN_SCENE, ShownDatum, shown_of
+from enact_dist.view.follower import Follower
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -48,7 +48,7 @@ def drawable(slots: Iterable[Slot], kinds: Callable[[str], frozenset[str] | None
     return found
 
 
-class Feed:
+class Feed(Follower):
     """The thread that follows a cell.
 
     Args:
@@ -72,6 +72,7 @@ class Feed:
         rate_hz: float,
         bytes_s: float,
     ) -> None:
+        super().__init__("view feed")
         self._source, self.shows_of = source, shows_of
         self._rate_hz, self._bytes_s = rate_hz, bytes_s
         self.catalogue = SlotCatalogue()
@@ -84,21 +85,6 @@ class Feed:
         self._sizes: dict[Slot, int] = {}
         self._wishes: dict[object, frozenset[Slot]] = {}
         self._budget, self._budget_s = bytes_s, time.monotonic()
-        self._news = threading.Condition()
-        self._stopped = False
-        self._thread = threading.Thread(target=self._run, name="view feed", daemon=True)
-
-    def start(self) -> None:
-        """Begin."""
-        self._thread.start()
-
-    def stop(self) -> None:
-        """End; twice is harmless."""
-        with self._news:
-            self._stopped = True
-            self._news.notify_all()
-        if self._thread.ident is not None:
-            self._thread.join()
 
     # ------------------------------------------------------------ for pages
 

@@ -176,7 +176,7 @@ def test_actor_row_has_what_it_reports_and_the_age_of_what_it_wrote():
 
 
 def test_silent_actor_has_no_rate():
-    """What it reported last says nothing of now."""
+    """Its last report describes an earlier time."""
     (row,) = Looks().add(Look(T0_S, actors=(actor(left_s=-2.0, rate_hz=10.0),))).actors
 
     assert (row.state, row.runs_hz) == ("silent", None)
@@ -238,7 +238,7 @@ def test_ages_of_data_are_those_at_the_look_that_showed_them():
 
 
 def test_slots_that_a_shard_does_not_list_stay_as_they_were():
-    """It is told once; when it lists them again, the rate is that of all the time between."""
+    """One event names the shard; its next listing gives the rate over all the time between."""
     looks, writer = Looks(), actor(writes=["online:camera/a/image"])
 
     def look(after_s, listed, **unlisted):

@@ -80,7 +80,7 @@ def test_actor_that_leaves_is_an_error_that_names_the_place(step, method, code):
 
 
 def test_error_of_stop_does_not_replace_that_of_update(cell, step):
-    """Both are told; one that `stop` alone raises is raised."""
+    """The result names both errors; an error of `stop` alone is raised."""
 
     class Stops(Doubles):
         def stop(self):

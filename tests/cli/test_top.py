@@ -199,7 +199,7 @@ async def test_title_says_when_slots_were_looked_at(screen):
 
 
 def test_error_of_a_look_ends_the_screen_and_is_raised_by_its_caller():
-    """It is told as the error of the command, not as a traceback of a thread."""
+    """The command prints it as its own error, without the traceback of a thread."""
 
     async def inside():
         async with top() as screen:
