@@ -178,11 +178,14 @@ class Trial:
             os.kill(pid, signal.SIGCONT)
 
     def kill(self, name: str) -> int:
-        """Kill the process of an actor, or else of a shard; return its number."""
-        pids = [one.pid for one in self.cell.actors() if name in one.names()]
-        pid = pids[0] if pids else self.processes.shard_pid(name)
+        """Kill the process of an actor, once its session is known; return its number."""
+        pid = self.actor(name).pid
         os.kill(pid, signal.SIGKILL)
         return pid
+
+    def kill_shard(self, name: str) -> None:
+        """Kill the process of a shard."""
+        os.kill(self.processes.shard_pid(name), signal.SIGKILL)
 
 
 @pytest.fixture(scope="module")
@@ -296,7 +299,7 @@ def test_an_actor_that_is_killed_comes_back(trial: Trial, name: str) -> None:
 def test_the_cell_goes_on_after_its_shard_was_killed(trial: Trial) -> None:
     """What was learned, and what plays, have outlived the shard: the person is seen again."""
     trial.moves()
-    trial.kill("cell")
+    trial.kill_shard("cell")
     trial.rests()
     trial.moves()
     trial.until(
