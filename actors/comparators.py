@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from actors.geometry.surface_distance import Mesh, clouds_apart, surfaces_apart
+from actors.geometry.surfaces.surface_distance import Mesh, clouds_apart, surfaces_apart
 from enact_dist import Difference
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
     from actors.geometry.shapes import PointCloud
-    from actors.geometry.surface_distance import Apart
+    from actors.geometry.surfaces.surface_distance import Apart
 
 
 class Triangulated(Protocol):
@@ -35,7 +35,7 @@ class Triangulated(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class SurfaceDistance:
-    """Compare surfaces by where they are, see `actors.geometry.surface_distance`.
+    """Compare surfaces by where they are, see `actors.geometry.surfaces.surface_distance`.
 
     The distance is what `share` of either surface stays within of the other one, in metres;
     `share=1.0` is the largest distance of all, which a stray vertex decides.  Triangulation,

@@ -43,7 +43,13 @@ UPWARD = {
 CIRCLES: dict[str, int] = {}
 """Circles of imports that are left: the first file of each, and how many files it has."""
 MODULES_MAX = 12
-MODULES_MAX_OF = {"cli": 16, "wire": 16}
+MODULES_MAX_OF = {
+    "enact_dist/cli": 16,
+    "enact_dist/wire": 16,
+    "actors/palletizing": 16,
+    "actors/workcell": 16,
+}
+"""Of the folders of verbs, of data types, and of the actors that a cell file names."""
 FULL_FOLDERS: dict[str, int] = {}
 """Folders with more modules, and with how many."""
 DEFINED_AGAIN: dict[str, int] = {"Outcome": 2}
@@ -182,8 +188,9 @@ def test_no_circle_of_imports():
 def test_folders_stay_small():
     """A folder is read at one glance; one that grows is split by a noun of the field."""
     full = {}
-    for folder in {file.parent for file in python_files(PACKAGE)}:
-        name = str(folder.relative_to(PACKAGE))
+    files = python_files(PACKAGE) + python_files(ROOT / "actors")
+    for folder in {file.parent for file in files}:
+        name = str(folder.relative_to(ROOT))
         count = sum(file.name != "__init__.py" for file in folder.glob("*.py"))
         if count > MODULES_MAX_OF.get(name, MODULES_MAX):
             full[name] = count

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from actors.geometry.projection import in_camera, on_image
+from actors.geometry.cameras.projection import in_camera, on_image
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

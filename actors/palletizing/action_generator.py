@@ -6,12 +6,12 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from actors.palletizing.controller import open_controller
-from actors.palletizing.expectation import Expectations
-from actors.palletizing.finger_room import Gripper
-from actors.palletizing.grasps import size_of
-from actors.palletizing.grounding import aside_net
-from actors.palletizing.handling import (
+from actors.palletizing.control.controller import open_controller
+from actors.palletizing.handling.expectation import Expectations
+from actors.palletizing.handling.grounding import aside_net
+from actors.palletizing.handling.nets import NetError
+from actors.palletizing.handling.reactions import BY_ITSELF, NO_NET
+from actors.palletizing.handling.stages import (
     ASIDE,
     IDLE,
     RISKY,
@@ -22,8 +22,8 @@ from actors.palletizing.handling import (
     frames_of,
     stages_of,
 )
-from actors.palletizing.nets import NetError
-from actors.palletizing.reactions import BY_ITSELF, NO_NET
+from actors.palletizing.placing.finger_room import Gripper
+from actors.palletizing.placing.grasps import size_of
 from actors.palletizing.vocabulary import (
     CANDIDATE,
     CELL,
@@ -54,8 +54,8 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from actors.palletizing.controller import ArmController
-    from actors.palletizing.finger_room import Beside
+    from actors.palletizing.control.controller import ArmController
+    from actors.palletizing.placing.finger_room import Beside
     from actors.palletizing.vocabulary import Attached, Request
     from enact_dist import Lock
 

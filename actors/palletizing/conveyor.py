@@ -5,8 +5,8 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Final
 
-from actors.palletizing.controller import open_controller
-from actors.palletizing.handling import is_current
+from actors.palletizing.control.controller import open_controller
+from actors.palletizing.handling.stages import is_current
 from actors.palletizing.vocabulary import (
     ARRIVAL,
     BELT,
@@ -33,7 +33,7 @@ from actors.palletizing.vocabulary import (
 from enact_dist import Actor, View, ViewEach, World, Write
 
 if TYPE_CHECKING:
-    from actors.palletizing.controller import BeltController
+    from actors.palletizing.control.controller import BeltController
     from enact_dist import Lock
 
 OFF_THE_BELT: Final = ("place", "push", "remove")

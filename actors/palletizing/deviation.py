@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from actors.geometry.deviation import Limits, inspect_place
 from actors.geometry.open3d_on_use import open3d
-from actors.geometry.segmentation import nearest
+from actors.geometry.recognition.deviation import Limits, inspect_place
+from actors.geometry.recognition.segmentation import nearest
 from actors.palletizing.vocabulary import (
     DEVIATIONS,
     OBSERVATION,

@@ -7,7 +7,19 @@ from collections import Counter
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
-from actors.palletizing.handling import (
+from actors.palletizing.handling.reactions import (
+    BY_ITSELF,
+    CANNOT,
+    MOST,
+    NO_NET,
+    UNFIT_ON_BELT,
+    Case,
+    Reaction,
+    choices_of,
+    react,
+    worst,
+)
+from actors.palletizing.handling.stages import (
     FELT_SIDE,
     GONE,
     IDLE,
@@ -19,18 +31,6 @@ from actors.palletizing.handling import (
     felt_on,
     is_current,
     is_held,
-)
-from actors.palletizing.reactions import (
-    BY_ITSELF,
-    CANNOT,
-    MOST,
-    NO_NET,
-    UNFIT_ON_BELT,
-    Case,
-    Reaction,
-    choices_of,
-    react,
-    worst,
 )
 from actors.palletizing.vocabulary import (
     CELL,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from actors.geometry.fusion import fuse_views
+from actors.geometry.surfaces.fusion import fuse_views
 from actors.palletizing.vocabulary import (
     NEWEST_VIEW,
     PRODUCTS,

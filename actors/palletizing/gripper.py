@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from actors.palletizing.controller import ControllerError, open_controller
+from actors.palletizing.control.controller import ControllerError, open_controller
 from actors.palletizing.vocabulary import COMMAND, GRIPPER, STATE, GripState
 from enact_dist import Actor, View, World, Write
 
 if TYPE_CHECKING:
-    from actors.palletizing.controller import GripperController
+    from actors.palletizing.control.controller import GripperController
     from actors.palletizing.vocabulary import GripCommand
     from enact_dist import Lock
 

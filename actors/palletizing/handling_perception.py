@@ -11,16 +11,23 @@ import time
 from collections import Counter
 from typing import TYPE_CHECKING, Any, Final
 
-from actors.geometry.depth import metres
 from actors.geometry.open3d_on_use import open3d
 from actors.geometry.poses import inverse
-from actors.geometry.registration import register
-from actors.geometry.segmentation import new_pieces
-from actors.palletizing.belt_sight import BeltWatch
-from actors.palletizing.handling import ASIDE, GONE, NOT_ASIDE, TAKEN_OUT, UNRECOGNISED, is_held
-from actors.palletizing.sensor import FRAMES as FRAMES_FUSED
-from actors.palletizing.sensor import SensorError, Watched, open_sensor
-from actors.palletizing.tray_changes import changed, tray_alone, without
+from actors.geometry.recognition.registration import register
+from actors.geometry.recognition.segmentation import new_pieces
+from actors.geometry.surfaces.depth import metres
+from actors.palletizing.handling.stages import (
+    ASIDE,
+    GONE,
+    NOT_ASIDE,
+    TAKEN_OUT,
+    UNRECOGNISED,
+    is_held,
+)
+from actors.palletizing.sight.belt_sight import BeltWatch
+from actors.palletizing.sight.sensor import FRAMES as FRAMES_FUSED
+from actors.palletizing.sight.sensor import SensorError, Watched, open_sensor
+from actors.palletizing.sight.tray_changes import changed, tray_alone, without
 from actors.palletizing.vocabulary import (
     ARRIVAL,
     BELT,
@@ -63,7 +70,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from actors.geometry.shapes import DepthFrame, Surface
-    from actors.palletizing.sensor import TraySensor
+    from actors.palletizing.sight.sensor import TraySensor
     from actors.palletizing.vocabulary import Arrival, Outcome, Request
     from enact_dist import Lock
 

@@ -8,7 +8,7 @@ import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
-from actors.palletizing.controller import open_controller
+from actors.palletizing.control.controller import open_controller
 from actors.palletizing.vocabulary import (
     DECISION,
     PACKAGES,

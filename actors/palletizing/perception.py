@@ -6,9 +6,14 @@ import time
 from functools import partial
 from typing import TYPE_CHECKING
 
-from actors.geometry.plate import seen_from
-from actors.geometry.segmentation import assigned, footprint_pose, new_pieces, product_on_plate
-from actors.palletizing.sensor import PLATE_M, open_sensor, steady
+from actors.geometry.recognition.plate import seen_from
+from actors.geometry.recognition.segmentation import (
+    assigned,
+    footprint_pose,
+    new_pieces,
+    product_on_plate,
+)
+from actors.palletizing.sight.sensor import PLATE_M, open_sensor, steady
 from actors.palletizing.vocabulary import (
     CLOUD,
     CONVEYOR,
@@ -34,7 +39,7 @@ from enact_dist import Actor, Entity, View, ViewEach, World, Write, WriteEach
 
 if TYPE_CHECKING:
     from actors.geometry.shapes import DepthFrame
-    from actors.palletizing.sensor import OrbitSensor, TraySensor
+    from actors.palletizing.sight.sensor import OrbitSensor, TraySensor
     from enact_dist import Lock
 
 

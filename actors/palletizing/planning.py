@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from actors.palletizing.controller import open_controller
-from actors.palletizing.grasps import size_of
-from actors.palletizing.handling import STANDS, is_current, results_of
-from actors.palletizing.pallet import planned_pose, tray_of
-from actors.palletizing.rows import contacts_between, planned_rows
+from actors.palletizing.control.controller import open_controller
+from actors.palletizing.handling.stages import STANDS, is_current, results_of
+from actors.palletizing.placing.grasps import size_of
+from actors.palletizing.placing.pallet import planned_pose, tray_of
+from actors.palletizing.placing.rows import contacts_between, planned_rows
 from actors.palletizing.vocabulary import (
     CELL,
     EMPTY,

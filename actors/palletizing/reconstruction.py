@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from actors.geometry.depth_reconstruction import reconstruct_view
+from actors.geometry.surfaces.depth_reconstruction import reconstruct_view
 from actors.palletizing.vocabulary import CLOUD, SURFACE, VIEWPOINT, VIEWS
 from enact_dist import Actor, View, World, Write
 

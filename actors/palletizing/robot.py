@@ -12,10 +12,10 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
-from actors.palletizing.control_loop import ControlLoop, ended_without_step
-from actors.palletizing.controller import open_controller
-from actors.palletizing.nets import TraceStep
-from actors.palletizing.urgency import make_urgent
+from actors.palletizing.control.control_loop import ControlLoop, ended_without_step
+from actors.palletizing.control.controller import open_controller
+from actors.palletizing.control.urgency import make_urgent
+from actors.palletizing.handling.nets import TraceStep
 from actors.palletizing.vocabulary import (
     COMMAND,
     CONTROL,
@@ -31,7 +31,7 @@ from actors.workcell.vocabulary import JOINTS
 from enact_dist import Actor, View, World, Write
 
 if TYPE_CHECKING:
-    from actors.palletizing.nets import Execution
+    from actors.palletizing.handling.nets import Execution
     from actors.palletizing.vocabulary import Control
     from enact_dist import Lock
 

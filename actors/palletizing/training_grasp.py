@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from actors.palletizing.grasps import grasp_of
+from actors.palletizing.placing.grasps import grasp_of
 from actors.palletizing.vocabulary import GRASP, PRODUCTS, SURFACE
 from enact_dist import Actor, View, World, Write
 

@@ -36,24 +36,24 @@ import numpy as np
 import numpy.typing as npt
 
 from actors.comparators import CloudDistance, SurfaceDistance
-from actors.geometry.deviation import Limits
+from actors.geometry.recognition.deviation import Limits
 from actors.geometry.shapes import Acquisition, DepthFrame, PointCloud, Surface
-from actors.palletizing.finger_room import Grasp
-from actors.palletizing.handling_data import Arrival as Arrival  # noqa: PLC0414
-from actors.palletizing.handling_data import Attached as Attached  # noqa: PLC0414
-from actors.palletizing.handling_data import Candidate as Candidate  # noqa: PLC0414
-from actors.palletizing.handling_data import Control as Control  # noqa: PLC0414
-from actors.palletizing.handling_data import Decision as Decision  # noqa: PLC0414
-from actors.palletizing.handling_data import GripCommand as GripCommand  # noqa: PLC0414
-from actors.palletizing.handling_data import GripState as GripState  # noqa: PLC0414
-from actors.palletizing.handling_data import Look as Look  # noqa: PLC0414
-from actors.palletizing.handling_data import Outcome as Outcome  # noqa: PLC0414
-from actors.palletizing.handling_data import Planned as Planned  # noqa: PLC0414
-from actors.palletizing.handling_data import Question as Question  # noqa: PLC0414
-from actors.palletizing.handling_data import Request as Request  # noqa: PLC0414
-from actors.palletizing.handling_data import Result as Result  # noqa: PLC0414
-from actors.palletizing.handling_data import Sight as Sight  # noqa: PLC0414
-from actors.palletizing.nets import Execution
+from actors.palletizing.handling.data import Arrival as Arrival  # noqa: PLC0414
+from actors.palletizing.handling.data import Attached as Attached  # noqa: PLC0414
+from actors.palletizing.handling.data import Candidate as Candidate  # noqa: PLC0414
+from actors.palletizing.handling.data import Control as Control  # noqa: PLC0414
+from actors.palletizing.handling.data import Decision as Decision  # noqa: PLC0414
+from actors.palletizing.handling.data import GripCommand as GripCommand  # noqa: PLC0414
+from actors.palletizing.handling.data import GripState as GripState  # noqa: PLC0414
+from actors.palletizing.handling.data import Look as Look  # noqa: PLC0414
+from actors.palletizing.handling.data import Outcome as Outcome  # noqa: PLC0414
+from actors.palletizing.handling.data import Planned as Planned  # noqa: PLC0414
+from actors.palletizing.handling.data import Question as Question  # noqa: PLC0414
+from actors.palletizing.handling.data import Request as Request  # noqa: PLC0414
+from actors.palletizing.handling.data import Result as Result  # noqa: PLC0414
+from actors.palletizing.handling.data import Sight as Sight  # noqa: PLC0414
+from actors.palletizing.handling.nets import Execution
+from actors.palletizing.placing.finger_room import Grasp
 from enact_dist import Aspect, Durability, Entities, Entity, Retention, Tolerance
 from enact_dist.actor.outcome import Outcome as NetOutcome
 
@@ -172,7 +172,7 @@ class Deviation:
         package: Entity that was judged; empty if nothing came.
         product: What it should be.
         verdict: "ok", "missing", "extra", "tipped", "moved" or "deformed".
-        deviation_mm: By how much, see `actors.geometry.deviation.Finding`.
+        deviation_mm: By how much, see `actors.geometry.recognition.deviation.Finding`.
         area_mm2: Area of the deviating region.
         shift_mm: Distance from the planned position.
         turn_deg: Turn against the planned pose.

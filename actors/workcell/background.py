@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from actors.geometry.arms.kinematics import capsules_at
 from actors.geometry.capsules import fill, outlines
-from actors.geometry.kinematics import capsules_at
-from actors.geometry.silhouettes import BackgroundStatistics, Subtraction, packed, unpacked
+from actors.geometry.hull.silhouettes import BackgroundStatistics, Subtraction, packed, unpacked
 from actors.workcell.vocabulary import (
     BACKGROUND,
     CALIBRATION,

@@ -13,7 +13,7 @@ import time
 from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from actors.workcell.sources import (
+from actors.workcell.cameras.sources import (
     FRAME_S,
     PERIOD_NS,
     CameraEndedError,
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from actors.workcell.sources import CameraSource
+    from actors.workcell.cameras.sources import CameraSource
     from actors.workcell.vocabulary import Calibration
 
     Image = npt.NDArray[np.uint8]

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 import numpy as np
 
-from actors.geometry.joint_paths import (
+from actors.geometry.arms.joint_paths import (
     BRAKING_RAMP_S,
     STARTING_SHARE,
     JoinedPath,

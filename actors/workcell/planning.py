@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from actors.geometry.arm_clearance import ArmSpheres, CellGrid, Clearance, GrownGrid
-from actors.geometry.joint_paths import JoinedPath, JointPath, PathSpeeds
-from actors.geometry.joint_planning import Plan, load, plan
+from actors.geometry.arms.clearance import ArmSpheres, CellGrid, Clearance, GrownGrid
+from actors.geometry.arms.joint_paths import JoinedPath, JointPath, PathSpeeds
+from actors.geometry.arms.joint_planning import Plan, load, plan
 from actors.workcell.motion import NOMINAL_M_S
 from actors.workcell.speed import SpeedControl
 from actors.workcell.vocabulary import (

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Final, Self
 
 import numpy as np
 
-from actors.geometry.kinematics import capsules_at
-from actors.geometry.refinement import Refinement
-from actors.geometry.visibility import camera_table, check_calibration
-from actors.geometry.visual_hull import VisualHull
-from actors.geometry.voxels import VoxelBlocks
+from actors.geometry.arms.kinematics import capsules_at
+from actors.geometry.hull.refinement import Refinement
+from actors.geometry.hull.visibility import camera_table, check_calibration
+from actors.geometry.hull.visual_hull import VisualHull
+from actors.geometry.hull.voxels import VoxelBlocks
 from actors.workcell.background import one_thread
 from actors.workcell.vocabulary import (
     BOXES,
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
-    from actors.geometry.visibility import CameraTable
+    from actors.geometry.hull.visibility import CameraTable
     from enact_dist import Lock
 
     F64 = npt.NDArray[np.float64]

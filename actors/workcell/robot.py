@@ -11,7 +11,7 @@ import threading
 import time
 from typing import TYPE_CHECKING, Final
 
-from actors.palletizing.sensor import open_sensor
+from actors.palletizing.sight.sensor import open_sensor
 from actors.workcell.motion import CYCLE_S, HostClock, Motion
 from actors.workcell.vocabulary import (
     EXECUTION,

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from actors.geometry.recordings import read_recording
-from actors.geometry.static_shapes import static_shapes
+from actors.geometry.scans.recordings import read_recording
+from actors.geometry.surfaces.static_shapes import static_shapes
 from actors.workcell.vocabulary import (
     BOXES,
     GRID,

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from actors.geometry.arms.joint_paths import JointPath, PathSpeeds
+from actors.geometry.arms.kinematics import capsules_at
 from actors.geometry.capsules import bounds
-from actors.geometry.joint_paths import JointPath, PathSpeeds
-from actors.geometry.kinematics import capsules_at
 from actors.geometry.separation import Reaction, Separation
 from actors.workcell.motion import BRAKING_M_S2, FUTURE_NS, NOMINAL_M_S, ROBOT_S
 from actors.workcell.vocabulary import (

@@ -13,8 +13,8 @@ from enact_dist.cli.verbs import DONE, FAILED, OptionGroup, Verb, flag, option
 from enact_dist.errors import ConfigError, EnactError
 
 if TYPE_CHECKING:
-    from actors.geometry.charuco import Board
-    from actors.workcell.calibrate import CalibrateReport
+    from actors.geometry.cameras.charuco import Board
+    from actors.workcell.folders.calibrate import CalibrateReport
 
 BOARD: Final = "8x11,0.024,0.018,4X4_50"
 """Fits on A4."""
@@ -88,7 +88,7 @@ def run_calibrate(options: argparse.Namespace) -> int:
 
 
 def _calibrate(options: argparse.Namespace) -> int:
-    from actors.geometry.charuco import board_of
+    from actors.geometry.cameras.charuco import board_of
     from actors.geometry.files import InputFileError
 
     try:
@@ -124,8 +124,8 @@ def _take(folder: Path, board: Board, options: argparse.Namespace, line: Progres
     Raises:
         EnactError: A camera cannot be used.
     """
-    from actors.workcell.board_shots import opened_sources, take_shots
-    from actors.workcell.sources import CameraError
+    from actors.workcell.cameras.board_shots import opened_sources, take_shots
+    from actors.workcell.cameras.sources import CameraError
 
     try:
         with opened_sources(options.sources) as sources:
@@ -139,7 +139,7 @@ def _take(folder: Path, board: Board, options: argparse.Namespace, line: Progres
 def _report_of(
     folder: Path, board: Board, options: argparse.Namespace, line: ProgressLine
 ) -> CalibrateReport:
-    from actors.workcell.calibrate import FILE, CalibrateOptions, calibrate
+    from actors.workcell.folders.calibrate import FILE, CalibrateOptions, calibrate
 
     wanted = CalibrateOptions(
         board,
@@ -161,7 +161,7 @@ def _report_of(
 
 
 def _print_board(board: Board, options: argparse.Namespace) -> int:
-    from actors.geometry.board_sheet import KINDS, MARGIN_M, sheet
+    from actors.geometry.cameras.board_sheet import KINDS, MARGIN_M, sheet
     from actors.geometry.files import check_output, write_whole
 
     file: Path = options.print_board

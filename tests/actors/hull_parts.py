@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from actors.geometry.capsules import fill, outlines
+from actors.geometry.hull.silhouettes import packed
+from actors.geometry.hull.visibility import camera_table
+from actors.geometry.hull.visual_hull import VisualHull
+from actors.geometry.hull.voxels import VoxelBlocks
 from actors.geometry.poses import inverse, looking_at
-from actors.geometry.silhouettes import packed
-from actors.geometry.visibility import camera_table
-from actors.geometry.visual_hull import VisualHull
-from actors.geometry.voxels import VoxelBlocks
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
 VOXEL_M = 0.05

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from actors.geometry.cameras.projection import in_camera, on_image
 from actors.geometry.capsules import (
     bounds,
     capsule_distances,
@@ -20,7 +21,6 @@ from actors.geometry.capsules import (
     volume_m3,
 )
 from actors.geometry.poses import inverse, looking_at
-from actors.geometry.projection import in_camera, on_image
 
 SEEDS = st.integers(0, 2**32 - 1)
 MATRIX = np.array([[440.0, 0, 319.5], [0, 440.0, 239.5], [0, 0, 1]])

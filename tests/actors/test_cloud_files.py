@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from actors.geometry.files import InputFileError
-from actors.geometry.pointcloud_files import read_cloud
-from actors.geometry.surface_files import ply_bytes
+from actors.geometry.scans.pointcloud_files import read_cloud
+from actors.geometry.surfaces.surface_files import ply_bytes
 
 o3d = pytest.importorskip("open3d", exc_type=ImportError)
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from actors.geometry.matching import NoMatchError, find_model, rigid_fit
 from actors.geometry.poses import inverse, moved, small_motion
+from actors.geometry.recognition.matching import NoMatchError, find_model, rigid_fit
 
 pytest.importorskip("open3d", exc_type=ImportError)
 

@@ -165,8 +165,8 @@ def test_a_legacy_cloud_is_changed_and_the_array_is_not(o3d, dtype, writable):
 
 def test_fusing_and_comparing_leave_what_was_received(o3d, recording):
     """Depth, colour and surface as from a lock: bit-equal after fusion and residual."""
-    from actors.geometry.recordings import read_recording
-    from actors.geometry.rgbd_fusion import fuse_frames, residual
+    from actors.geometry.scans.recordings import read_recording
+    from actors.geometry.surfaces.rgbd_fusion import fuse_frames, residual
 
     frames = [
         replace(
@@ -190,9 +190,9 @@ def test_fusing_and_comparing_leave_what_was_received(o3d, recording):
 
 def test_clouds_and_scenes_leave_what_was_received(o3d):
     """Thinning, clusters, ray casting and matching's features on read-only points."""
-    from actors.geometry.clutter import clusters_of, thinned
-    from actors.geometry.matching import _Described
-    from actors.geometry.rendering import cast, ray_scene
+    from actors.geometry.recognition.clutter import clusters_of, thinned
+    from actors.geometry.recognition.matching import _Described
+    from actors.geometry.surfaces.rendering import cast, ray_scene
 
     points_m = received(POINTS)
     triangles = received(np.arange(300, dtype=np.uint32).reshape(100, 3))

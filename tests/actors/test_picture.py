@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from actors.geometry.cloud_picture import draw_points, with_box
 from actors.geometry.files import write_whole
-from actors.geometry.mesh_picture import Body, draw_bodies, viewpoint
-from actors.geometry.picture import (
+from actors.geometry.pictures.cloud_picture import draw_points, with_box
+from actors.geometry.pictures.mesh_picture import Body, draw_bodies, viewpoint
+from actors.geometry.pictures.picture import (
     bars,
     depth_picture,
     png_bytes,

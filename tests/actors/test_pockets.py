@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from actors.geometry.pockets import Pockets
+from actors.geometry.hull.pockets import Pockets
 
 from .hull_parts import small_grid
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from actors.geometry.poses import moved, small_motion
-from actors.palletizing import real_pictures
-from actors.palletizing.real_input import run_match, run_views
+from actors.palletizing.real import pictures as real_pictures
+from actors.palletizing.real.input import run_match, run_views
 
 o3d = pytest.importorskip("open3d", exc_type=ImportError)
 

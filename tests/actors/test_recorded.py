@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from actors.palletizing.reconstruction import Reconstruction
-from actors.palletizing.recorded import (
+from actors.palletizing.real.recorded import (
     COLOUR,
     COLOURED_SURFACE,
     RECORDED,
     RecordedFusion,
     RecordedPerception,
 )
+from actors.palletizing.reconstruction import Reconstruction
 from actors.palletizing.vocabulary import CLOUD, SCAN, VIEWPOINT, product_entity, view_entity
 from enact_dist import View
 from enact_dist.testing import run_once, worlds

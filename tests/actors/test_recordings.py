@@ -7,7 +7,7 @@ import pytest
 
 from actors.geometry.files import InputFileError
 from actors.geometry.poses import small_motion
-from actors.geometry.recordings import read_recording
+from actors.geometry.scans.recordings import read_recording
 
 cv2 = pytest.importorskip("cv2", exc_type=ImportError)
 

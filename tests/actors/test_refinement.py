@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from actors.geometry.capsules import distance_between, distance_to_points
-from actors.geometry.overruled import grown
-from actors.geometry.refinement import Refinement
-from actors.geometry.silhouettes import Subtraction, packed
+from actors.geometry.hull.overruled import grown
+from actors.geometry.hull.refinement import Refinement
+from actors.geometry.hull.silhouettes import Subtraction, packed
 
 from .hull_parts import BODY, bits_of, box_row, hull_of, masks_of, ring, small_grid
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from actors.geometry.recordings import read_recording
-from actors.geometry.rgbd_fusion import (
+from actors.geometry.scans.recordings import read_recording
+from actors.geometry.surfaces.rgbd_fusion import (
     FusionError,
     fuse_frames,
     natural_voxel_m,
     residual,
     view_cloud,
 )
-from actors.geometry.surface_files import ply_bytes
+from actors.geometry.surfaces.surface_files import ply_bytes
 
 o3d = pytest.importorskip("open3d", exc_type=ImportError)
 

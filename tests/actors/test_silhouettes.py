@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from actors.geometry.silhouettes import (
+from actors.geometry.hull.silhouettes import (
     SUBTRACTORS,
     BackgroundStatistics,
     Subtraction,

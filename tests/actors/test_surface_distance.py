@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from actors.comparators import CloudDistance, SurfaceDistance
 from actors.geometry.shapes import PointCloud, Surface
-from actors.geometry.surface_distance import Mesh, clouds_apart, samples_on, surfaces_apart
+from actors.geometry.surfaces.surface_distance import Mesh, clouds_apart, samples_on, surfaces_apart
 from enact_dist.comparing import EQUAL
 
 PATCH = np.array([[0, 1, 2], [1, 3, 2]])

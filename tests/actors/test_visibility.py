@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from actors.geometry.projection import in_camera, on_image
-from actors.geometry.visibility import (
+from actors.geometry.cameras.projection import in_camera, on_image
+from actors.geometry.hull.visibility import (
     GROWN_PX,
     camera_table,
     check_calibration,
@@ -17,7 +17,7 @@ from actors.geometry.visibility import (
     seen_by,
     static_voxels,
 )
-from actors.geometry.voxels import VoxelBlocks
+from actors.geometry.hull.voxels import VoxelBlocks
 
 from .hull_parts import FOCAL, HEIGHT, WIDTH, box_row, ring, small_grid
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from actors.geometry.capsules import distance_to_points
-from actors.geometry.silhouettes import packed
+from actors.geometry.hull.silhouettes import packed
 
 from .hull_parts import BODY, bits_of, hull_of, masks_of, ring, small_grid
 

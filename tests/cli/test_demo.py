@@ -27,16 +27,16 @@ def test_options_that_do_not_fit_are_refused(enact, words, reason):
 
 def test_missing_extra_is_named_with_its_command(enact, monkeypatch):
     """Without Open3D the error says which extra to install."""
-    monkeypatch.setitem(sys.modules, "actors.palletizing.demo_packing", None)
+    monkeypatch.setitem(sys.modules, "actors.palletizing.demo.packing", None)
     error = ModuleNotFoundError("No module named 'open3d'", name="open3d")
 
     class Finder:
         @staticmethod
         def find_spec(name, *_):
-            if name == "actors.palletizing.demo_packing":
+            if name == "actors.palletizing.demo.packing":
                 raise error
 
-    monkeypatch.delitem(sys.modules, "actors.palletizing.demo_packing")
+    monkeypatch.delitem(sys.modules, "actors.palletizing.demo.packing")
     monkeypatch.setattr(sys, "meta_path", [Finder, *sys.meta_path])
 
     result = enact("demo", "palletizing")
@@ -84,10 +84,10 @@ def test_missing_extra_of_the_workcell_is_named_with_its_command(enact, monkeypa
     class Finder:
         @staticmethod
         def find_spec(name, *_):
-            if name == "actors.workcell.demo":
+            if name == "actors.workcell.demo.run":
                 raise error
 
-    monkeypatch.delitem(sys.modules, "actors.workcell.demo", raising=False)
+    monkeypatch.delitem(sys.modules, "actors.workcell.demo.run", raising=False)
     monkeypatch.setattr(sys, "meta_path", [Finder, *sys.meta_path])
 
     result = enact("demo", "workcell")

@@ -3,7 +3,7 @@
 import json
 import time
 
-from actors.palletizing.demo_cell import TEMPLATE
+from actors.palletizing.demo.cell import TEMPLATE
 
 PACKAGES = 4
 WAIT_S = 180.0

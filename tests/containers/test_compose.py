@@ -82,7 +82,7 @@ TAKE = """begun_s = time.monotonic()
 def alone(tmp_path_factory):
     """The same cell on this machine, without containers; its report once it is done."""
     out = tmp_path_factory.mktemp("alone")
-    run = "import pathlib, sys; from actors.palletizing.demo import run_demo"
+    run = "import pathlib, sys; from actors.palletizing.demo.run import run_demo"
     run += "; sys.exit(run_demo(out=pathlib.Path(sys.argv[1]), packages=int(sys.argv[2])))"
     with subprocess.Popen(
         [sys.executable, "-c", run, str(out), str(PACKAGES)], stdout=subprocess.PIPE, text=True

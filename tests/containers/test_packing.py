@@ -9,7 +9,7 @@ pytest.importorskip("open3d", exc_type=ImportError)
 
 from stack import Stack
 
-from actors.palletizing.demo_robot_cell import TEMPLATE
+from actors.palletizing.demo.robot_cell import TEMPLATE
 
 pytestmark = [pytest.mark.containers, pytest.mark.sampled(1, of="applications in containers")]
 

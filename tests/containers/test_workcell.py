@@ -9,8 +9,8 @@ pytest.importorskip("cv2", exc_type=ImportError)
 from stack import Stack, until
 
 from actors.running_cell import toml_of
-from actors.workcell.demo_cell import TEMPLATE, configured
-from actors.workcell.demo_options import Options
+from actors.workcell.demo.cell import TEMPLATE, configured
+from actors.workcell.demo.options import Options
 
 pytestmark = [pytest.mark.containers, pytest.mark.sampled(1, of="applications in containers")]
 

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from actors.palletizing.simulation.cell_arm import CYCLE_S
-from actors.palletizing.simulation.cell_scene import centre_of_mass
+from actors.palletizing.simulation.cell.arm import CYCLE_S
+from actors.palletizing.simulation.cell.scene import centre_of_mass
 from actors.palletizing.simulation.physical_packages import STIFFNESS_N_MM
 from actors.palletizing.simulation.products import product_mesh
 

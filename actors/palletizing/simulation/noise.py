@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from actors.geometry.depth import millimetres, spread_m
+from actors.geometry.surfaces.depth import millimetres, spread_m
 
 if TYPE_CHECKING:
     import numpy.typing as npt

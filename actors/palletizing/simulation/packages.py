@@ -16,10 +16,10 @@ import numpy as np
 
 from actors.geometry.open3d_arrays import tensor
 from actors.geometry.poses import inverse, moved, on_tray
-from actors.geometry.rendering import ray_scene
 from actors.geometry.shapes import Surface
-from actors.palletizing.pallet import TRAY_PLACES, planned_pose, tray_of
-from actors.palletizing.rows import contacts_between, planned_rows
+from actors.geometry.surfaces.rendering import ray_scene
+from actors.palletizing.placing.pallet import TRAY_PLACES, planned_pose, tray_of
+from actors.palletizing.placing.rows import contacts_between, planned_rows
 from actors.palletizing.simulation.products import box_mesh, product_mesh
 
 if TYPE_CHECKING:

@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 import numpy as np
 
-from actors.geometry.kinematics import link_poses
+from actors.geometry.arms.kinematics import link_poses
 from actors.geometry.poses import inverse, moved
 from actors.geometry.shapes import VGA, Acquisition, DepthFrame
-from actors.palletizing.controller import ControllerError
-from actors.palletizing.simulation.cell_scene import (
+from actors.palletizing.control.controller import ControllerError
+from actors.palletizing.simulation.cell.scene import (
     ARM,
     BELT_AHEAD_M,
     BELT_HALF_M,
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
-    from actors.palletizing.simulation.cell_truth import ShownCell, ShownPackage
+    from actors.palletizing.simulation.cell.truth import ShownCell, ShownPackage
 
     F64 = npt.NDArray[np.float64]
     Mesh = tuple[F64, npt.NDArray[np.int32]]

@@ -13,7 +13,7 @@
 Rules a change must keep: a cell is a function of its packages, its seed and the commands it got in
 each cycle; `mj_forward` follows every pose that is set by hand, or bodies are where they were
 before; poses are read off bodies, never off geoms (MuJoCo moves the geom of a mesh to its centre).
-It is not for several threads: `cell_thread` runs it in one of its own.
+It is not for several threads: `cell.thread` runs it in one of its own.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from actors.geometry.poses import inverse, on_tray
-from actors.palletizing.controller import ControllerError
-from actors.palletizing.simulation.cell_arm import CYCLE_S, STEPS, SimulatedArm
-from actors.palletizing.simulation.cell_contacts import Contacts, GripWatch
-from actors.palletizing.simulation.cell_scene import (
+from actors.palletizing.control.controller import ControllerError
+from actors.palletizing.simulation.cell.arm import CYCLE_S, STEPS, SimulatedArm
+from actors.palletizing.simulation.cell.contacts import Contacts, GripWatch
+from actors.palletizing.simulation.cell.scene import (
     BARRIER_M,
     BELT_HALF_M,
     BELT_M_S,
@@ -38,7 +38,7 @@ from actors.palletizing.simulation.cell_scene import (
     load_mujoco,
     scene_xml,
 )
-from actors.palletizing.simulation.cell_truth import (
+from actors.palletizing.simulation.cell.truth import (
     CellTruth,
     PackageTruth,
     ShownCell,

@@ -24,10 +24,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from actors.palletizing.controller import ArmMeasured, ControllerError, GripperMeasured
-from actors.palletizing.simulation.cell_arm import CYCLE_S
-from actors.palletizing.simulation.cell_messages import receive, send
-from actors.palletizing.simulation.cell_scene import ARM, HOME_RAD, CellLayout
+from actors.palletizing.control.controller import ArmMeasured, ControllerError, GripperMeasured
+from actors.palletizing.simulation.cell.arm import CYCLE_S
+from actors.palletizing.simulation.cell.messages import receive, send
+from actors.palletizing.simulation.cell.scene import ARM, HOME_RAD, CellLayout
 from actors.palletizing.simulation.physical_sensors import PhysicalBeltSensor, PhysicalTraySensor
 
 if TYPE_CHECKING:
@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
-    from actors.geometry.joint_paths import Arm
-    from actors.palletizing.simulation.cell_truth import CellTruth, ShownCell
+    from actors.geometry.arms.joint_paths import Arm
+    from actors.palletizing.simulation.cell.truth import CellTruth, ShownCell
 
     F64 = npt.NDArray[np.float64]
 
@@ -77,7 +77,7 @@ class RemoteCell:
                 host, port = self._address
                 raise ControllerError(
                     f"asked the cell at {host}:{port} for {name}: {error}; run"
-                    " actors.palletizing.simulation.cell_server with this port"
+                    " actors.palletizing.simulation.cell.server with this port"
                 ) from error
         if "error" in answer:
             raise ControllerError(answer["error"])

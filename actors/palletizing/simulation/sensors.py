@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from actors.geometry.poses import inverse, looking_at, moved, on_tray, small_motion
-from actors.geometry.rendering import depth_where_seen
 from actors.geometry.shapes import VGA, Acquisition, DepthFrame
-from actors.palletizing.sensor import PLATE_M
+from actors.geometry.surfaces.rendering import depth_where_seen
+from actors.palletizing.sight.sensor import PLATE_M
 from actors.palletizing.simulation.noise import DARK, Light, sensed
 from actors.palletizing.simulation.packages import (
     DEMO_PRODUCTS,

@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from actors.workcell.camera import Camera
+from actors.workcell.cameras.sources import CameraError
 from actors.workcell.simulation.sources import LiveSource
 from actors.workcell.smart_camera import SmartCamera
-from actors.workcell.sources import CameraError
 from actors.workcell.vocabulary import JOINTS, PLAYING, ROBOT, SCENARIO
 from enact_dist import Lock, View, World
 
 if TYPE_CHECKING:
-    from actors.workcell.sources import CameraSource
+    from actors.workcell.cameras.sources import CameraSource
 
 
 class SimulatedCamera(Camera):

@@ -31,13 +31,13 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from actors.geometry.kinematics import capsules_at
+from actors.geometry.arms.kinematics import capsules_at
+from actors.workcell.cameras.sources import PERIOD_NS, CameraError
 from actors.workcell.simulation.arm import ARM
+from actors.workcell.simulation.drawing.render import View
 from actors.workcell.simulation.human import CAPSULES
-from actors.workcell.simulation.render import View
 from actors.workcell.simulation.room import cameras
 from actors.workcell.simulation.stage import Stage
-from actors.workcell.sources import PERIOD_NS, CameraError
 from actors.workcell.vocabulary import PERIOD_S
 
 if TYPE_CHECKING:
@@ -350,7 +350,7 @@ def _info(
 def _draws(renderer: str, calibrations: Sequence[Calibration], stage: Stage) -> list[Draw]:
     """Return a function per camera that draws a scene."""
     if renderer == "mujoco":
-        from actors.workcell.simulation.mujoco_views import mujoco_draws
+        from actors.workcell.simulation.drawing.mujoco_views import mujoco_draws
 
         return mujoco_draws(calibrations, stage)
 

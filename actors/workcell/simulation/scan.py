@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Final, cast
 import numpy as np
 
 from actors.geometry.poses import inverse, looking_at, moved
-from actors.geometry.rendering import cast as cast_rays
-from actors.geometry.rendering import directions, ray_scene
 from actors.geometry.shapes import VGA, Acquisition, Camera, DepthFrame
+from actors.geometry.surfaces.rendering import cast as cast_rays
+from actors.geometry.surfaces.rendering import directions, ray_scene
 from actors.palletizing.simulation.noise import sensed
 from actors.palletizing.simulation.products import box_mesh
 from actors.workcell.simulation.room import BOXES, HALF_M

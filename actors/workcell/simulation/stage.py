@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from actors.workcell.simulation.drawing.render import person_colours, robot_colours
 from actors.workcell.simulation.human import Person
-from actors.workcell.simulation.render import person_colours, robot_colours
 from actors.workcell.simulation.room import THING_COLOUR, Box, boxes_of
 
 if TYPE_CHECKING:

@@ -26,7 +26,7 @@ def run_palletizing(run: Run) -> None:
     try:
         import mujoco  # noqa: F401
 
-        from actors.palletizing import packing_scores as packing
+        from actors.palletizing.trials import packing_scores as packing
     except ImportError as error:
         raise MisuseError(
             f"bench {NAME} needs {error.name}, which is not installed; install its extras:"
@@ -72,7 +72,7 @@ def run_palletizing(run: Run) -> None:
 
 def _score_perception(run: Run, asked: PackingOptions) -> None:
     """Judge drawn packages, over noise and light of the sensor; no robot, no physics."""
-    from actors.palletizing import perception_scores as scores
+    from actors.palletizing.trials import perception_scores as scores
 
     seed = scores.HELD_OUT + asked.seed
     for series, scored in scores.played(asked.packages, seed=seed, processes=asked.processes):

@@ -42,9 +42,9 @@ def run_workcell(run: Run) -> None:
         from rich.console import Console
 
         from actors.running_cell import DemoError
-        from actors.workcell.demo import run_quietly, with_recording
-        from actors.workcell.demo_options import Options
-        from actors.workcell.unshared import UnsharedCell
+        from actors.workcell.demo.options import Options
+        from actors.workcell.demo.run import run_quietly, with_recording
+        from actors.workcell.demo.unshared import UnsharedCell
     except ImportError as error:
         raise MisuseError(
             f"bench workcell needs {error.name}, which is not installed; install its extras:"
@@ -80,8 +80,8 @@ def run_workcell(run: Run) -> None:
 
 def _run_embedded(run: Run) -> None:
     """Play the scenarios in simulated time."""
-    from actors.workcell.quality import quality
     from actors.workcell.scenarios import SCENARIOS
+    from actors.workcell.scores.quality import quality
 
     seeds = range(1, run.seeds + 1)
     found = quality(SCENARIOS[1:], seeds, seconds=EMBEDDED_TIMES * run.seconds_s, told=run.told)
@@ -90,8 +90,8 @@ def _run_embedded(run: Run) -> None:
 
 def _add_scores(run: Run, scores: Mapping[str, float]) -> None:
     """Add a row per score."""
-    from actors.workcell.demo_report import value_text
-    from actors.workcell.evaluation import GOALS, missed
+    from actors.workcell.demo.report import value_text
+    from actors.workcell.scores.evaluation import GOALS, missed
 
     failed = set(missed(scores))
     sets = round(scores.get("sets", scores.get("moments", 0.0) / 10.0))

@@ -20,7 +20,7 @@ and one calibration of all cameras, with x_camera = R X + t:
   CAMERA.yml, .yaml, .xml      of OpenCV, in the same places: camera_matrix,
                                distortion_coefficients, and R with t, or projection_matrix
 bounds.json, {"low": [x, y, z], "high": [x, y, z]}, says where to look, if that is known."""
-"""What a folder of pictures holds; `camera_sets` and `folder_pictures` read it."""
+"""What a folder of pictures holds; `camera_sets` and `folders.pictures` read it."""
 
 _OUT: Final = file_of("--out", "DIR", "where pictures and tables go")
 _KEEP_RUNNING: Final = flag("--keep-running", "leave the cell up afterwards, until Ctrl-C")

@@ -30,18 +30,18 @@ def _run(options: argparse.Namespace) -> int:
     if options.check_net:
         return _check_net(options.check_net, out)
     if options.views:
-        from actors.palletizing.real_input import run_views
+        from actors.palletizing.real.input import run_views
 
         return run_views(options.views, out)
     if options.model:
-        from actors.palletizing.real_input import run_match
+        from actors.palletizing.real.input import run_match
 
         return run_match(options.model, options.scene, out)
     if options.cell:
-        from actors.palletizing.demo_packing import watch_packing
+        from actors.palletizing.demo.packing import watch_packing
 
         return watch_packing(options.cell, out=out)
-    from actors.palletizing.demo_packing import run_packing
+    from actors.palletizing.demo.packing import run_packing
 
     names = ("packages", "seed", "speed")
     given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
@@ -49,8 +49,8 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _check_net(file: Path, out: Path) -> int:
-    from actors.palletizing.net_check import check_net
-    from actors.palletizing.nets import NetError
+    from actors.palletizing.handling.net_check import check_net
+    from actors.palletizing.handling.nets import NetError
 
     try:
         print(check_net(file, out))

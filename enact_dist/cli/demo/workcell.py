@@ -33,9 +33,9 @@ def _run(options: argparse.Namespace) -> int:
     _refuse_mixture(options)
     if options.cameras:
         return _run_folder(options, out)
-    from actors.workcell.demo import record_views, run_demo
-    from actors.workcell.demo_cell import options_of
-    from actors.workcell.demo_options import Options
+    from actors.workcell.demo.cell import options_of
+    from actors.workcell.demo.options import Options
+    from actors.workcell.demo.run import record_views, run_demo
 
     if options.cell:
         out.mkdir(parents=True, exist_ok=True)
@@ -67,8 +67,8 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _run_folder(options: argparse.Namespace, out: Path) -> int:
-    from actors.workcell.folder_pictures import colour_of
-    from actors.workcell.folders import FolderOptions, run_folder
+    from actors.workcell.folders.pictures import colour_of
+    from actors.workcell.folders.run import FolderOptions, run_folder
 
     given: dict[str, Any] = {
         name: getattr(options, name)

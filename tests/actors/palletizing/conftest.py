@@ -12,8 +12,8 @@ os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo chooses what draws when it i
 def trained():
     """Return a function from a product's name to the surface that 14 views of it give, of four images each."""
     pytest.importorskip("open3d", exc_type=ImportError)
-    from actors.palletizing.evaluation import train
     from actors.palletizing.simulation.sensors import SimulatedOrbitSensor
+    from actors.palletizing.trials.evaluation import train
 
     return lru_cache(lambda product: train(product, SimulatedOrbitSensor(seed=5), frames=4))
 
@@ -22,8 +22,8 @@ def trained():
 def tray():
     """Return an overhead sensor whose first package is missing."""
     pytest.importorskip("open3d", exc_type=ImportError)
-    from actors.palletizing.evaluation import graded
     from actors.palletizing.simulation.sensors import SimulatedTraySensor
+    from actors.palletizing.trials.evaluation import graded
 
     packages = graded("missing", 0.0, 1, seed=1, products=["milk_carton"])
     return SimulatedTraySensor(packages, seed=2)

@@ -8,9 +8,9 @@ from actors.palletizing import vocabulary as words
 from actors.palletizing.action import Action
 from actors.palletizing.action_generator import ActionGenerator
 from actors.palletizing.feedback import HandlingFeedback
-from actors.palletizing.nets import Execution
+from actors.palletizing.handling.nets import Execution
 from actors.palletizing.planning import RowPlanning
-from actors.palletizing.simulation.cell_scene import HOME_RAD
+from actors.palletizing.simulation.cell.scene import HOME_RAD
 from actors.palletizing.training_grasp import TrainingGrasp
 from actors.workcell.vocabulary import JOINTS, JOINTS_KEPT, Joints
 from enact_dist import Entity, Lock, View, ViewEach, Write, testing

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from actors.geometry.kinematics import jacobians, tool_poses
+from actors.geometry.arms.kinematics import jacobians, tool_poses
 from actors.geometry.poses import on_tray
-from actors.palletizing.simulation.cell_scene import ARM, HOME_RAD, TABLE_M
+from actors.palletizing.simulation.cell.scene import ARM, HOME_RAD, TABLE_M
 from actors.palletizing.simulation.physical_packages import PhysicalPackage
 from actors.palletizing.simulation.physics import PhysicalCell
 

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from actors.geometry.poses import turned
-from actors.palletizing.nets import (
+from actors.palletizing.handling.nets import (
     AXES,
     QUANTITIES,
     UNITS,

@@ -4,9 +4,9 @@ import dataclasses
 
 import numpy as np
 
-from actors.geometry.kinematics import tool_poses
-from actors.palletizing.controller import Measured
-from actors.palletizing.execution import Executor
+from actors.geometry.arms.kinematics import tool_poses
+from actors.palletizing.control.controller import Measured
+from actors.palletizing.control.execution import Executor
 from actors.workcell.simulation.arm import ARM as WORKCELL_ARM
 
 ARM = dataclasses.replace(WORKCELL_ARM, base=np.eye(4))

@@ -6,11 +6,11 @@ import pytest
 pytest.importorskip("open3d", exc_type=ImportError)
 pytest.importorskip("mujoco", exc_type=ImportError)
 
-from actors.geometry.depth import fused, metres
 from actors.geometry.poses import inverse, on_tray, turned, yaw_between, yaw_of
 from actors.geometry.shapes import VGA, Acquisition, DepthFrame
-from actors.palletizing.belt_sight import MISFIT_MAX_M, BeltWatch, seen_on_belt
-from actors.palletizing.sensor import steady
+from actors.geometry.surfaces.depth import fused, metres
+from actors.palletizing.sight.belt_sight import MISFIT_MAX_M, BeltWatch, seen_on_belt
+from actors.palletizing.sight.sensor import steady
 from actors.palletizing.simulation.physical_sensors import PhysicalBeltSensor
 from actors.palletizing.simulation.physics import PhysicalCell
 from actors.palletizing.simulation.products import PRODUCTS, product_mesh

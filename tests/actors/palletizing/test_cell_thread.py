@@ -6,9 +6,9 @@ import time
 import numpy as np
 import pytest
 
-from actors.palletizing.controller import ControllerError
-from actors.palletizing.simulation.cell_scene import HOME_RAD
-from actors.palletizing.simulation.cell_thread import RunningCell
+from actors.palletizing.control.controller import ControllerError
+from actors.palletizing.simulation.cell.scene import HOME_RAD
+from actors.palletizing.simulation.cell.thread import RunningCell
 from actors.palletizing.simulation.physics import PhysicalCell
 
 from .moves import carton

@@ -5,13 +5,13 @@ import pytest
 
 o3d = pytest.importorskip("open3d", exc_type=ImportError)
 
-from actors.geometry.fusion import fuse_views, vertex_normals  # noqa: E402
-from actors.geometry.plate import seen_from  # noqa: E402
 from actors.geometry.poses import inverse, looking_at, moved, small_motion  # noqa: E402
-from actors.geometry.rendering import directions, ray_scene  # noqa: E402
+from actors.geometry.recognition.plate import seen_from  # noqa: E402
 from actors.geometry.shapes import VGA, Acquisition, DepthFrame, Surface  # noqa: E402
-from actors.geometry.solid import SeenDepth, solid_surface  # noqa: E402
-from actors.palletizing.sensor import PLATE_M  # noqa: E402
+from actors.geometry.surfaces.fusion import fuse_views, vertex_normals  # noqa: E402
+from actors.geometry.surfaces.rendering import directions, ray_scene  # noqa: E402
+from actors.geometry.surfaces.solid import SeenDepth, solid_surface  # noqa: E402
+from actors.palletizing.sight.sensor import PLATE_M  # noqa: E402
 from actors.palletizing.simulation.products import PRODUCTS, product_mesh  # noqa: E402
 from actors.palletizing.simulation.sensors import (  # noqa: E402
     ROBOT_SPREAD_M,

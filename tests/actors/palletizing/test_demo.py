@@ -14,14 +14,14 @@ import pytest
 
 pytest.importorskip("open3d", exc_type=ImportError)
 
-from actors.geometry.deviation import VERDICTS
 from actors.geometry.poses import looking_at
+from actors.geometry.recognition.deviation import VERDICTS
 from actors.geometry.shapes import VGA, Acquisition, DepthFrame, Surface
-from actors.palletizing.demo import SEED, run_demo
-from actors.palletizing.demo_cell import TEMPLATE, RunningCell, configured, watched_cell
-from actors.palletizing.demo_packing import run_packing
-from actors.palletizing.demo_pictures import model_picture, tray_picture
-from actors.palletizing.demo_report import report_bytes, rows_of, score_of
+from actors.palletizing.demo.cell import TEMPLATE, RunningCell, configured, watched_cell
+from actors.palletizing.demo.packing import run_packing
+from actors.palletizing.demo.pictures import model_picture, tray_picture
+from actors.palletizing.demo.report import report_bytes, rows_of, score_of
+from actors.palletizing.demo.run import SEED, run_demo
 from actors.palletizing.feedback import sentence
 from actors.palletizing.simulation.packages import KINDS, package_sequence
 from actors.palletizing.simulation.products import product_mesh

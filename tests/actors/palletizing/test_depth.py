@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from actors.geometry.depth import (
+from actors.geometry.shapes import VGA
+from actors.geometry.surfaces.depth import (
     depth_of_points,
     grid_normals,
     mean_known,
@@ -13,7 +14,6 @@ from actors.geometry.depth import (
     points_grid,
     spread_m,
 )
-from actors.geometry.shapes import VGA
 
 
 def wavy_depth_m() -> np.ndarray:

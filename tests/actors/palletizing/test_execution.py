@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from actors.geometry.poses import roll_pitch_yaw, turned
-from actors.palletizing.execution import Executor, Grip
-from actors.palletizing.nets import NetError
-from actors.palletizing.resolved_rate import ACCELERATION_RAD_S2, rotation_vector
+from actors.palletizing.control.execution import Executor, Grip
+from actors.palletizing.control.resolved_rate import ACCELERATION_RAD_S2, rotation_vector
+from actors.palletizing.handling.nets import NetError
 
 from .sound_nets import axes, net, primitive, way
 from .spring_arm import ARM, CYCLE_S, HOME_RAD, SpringArm, pose, run
@@ -172,7 +172,7 @@ class BlockedArm(SpringArm):
 
     def lead_m(self):
         """Return how far the command is ahead."""
-        from actors.geometry.kinematics import tool_poses
+        from actors.geometry.arms.kinematics import tool_poses
 
         return float(np.linalg.norm(tool_poses(ARM, self.commanded)[0, :3, 3] - self.tcp[:3, 3]))
 

@@ -10,9 +10,9 @@ pytest.importorskip("open3d", exc_type=ImportError)
 pytest.importorskip("mujoco", exc_type=ImportError)
 
 from actors.palletizing import vocabulary as words
-from actors.palletizing.demo_packing import follow
+from actors.palletizing.demo.packing import follow
 from actors.palletizing.feedback import HandlingFeedback
-from actors.palletizing.handling import TAKEN_OUT, UNRECOGNISED
+from actors.palletizing.handling.stages import TAKEN_OUT, UNRECOGNISED
 from actors.palletizing.operator import LOOKS, Operator
 from actors.running_cell import DemoError
 from enact_dist import Entity, testing

@@ -6,11 +6,10 @@ import math
 import numpy as np
 import pytest
 
-from actors.geometry.kinematics import tool_poses
-from actors.geometry.reaching import reach
-from actors.palletizing import finger_room
-from actors.palletizing.finger_room import Grasp, Gripper
-from actors.palletizing.grounding import (
+from actors.geometry.arms.kinematics import tool_poses
+from actors.geometry.arms.reaching import reach
+from actors.palletizing.control.resolved_rate import ACCELERATION_RAD_S2
+from actors.palletizing.handling.grounding import (
     BESIDE_M,
     FOLDER,
     SKELETONS,
@@ -19,11 +18,12 @@ from actors.palletizing.grounding import (
     easier_turn,
     ground,
 )
-from actors.palletizing.net_files import text_of_net
-from actors.palletizing.nets import NetError
-from actors.palletizing.resolved_rate import ACCELERATION_RAD_S2
-from actors.palletizing.rows import RIM_M
-from actors.palletizing.simulation.cell_scene import CellLayout
+from actors.palletizing.handling.net_files import text_of_net
+from actors.palletizing.handling.nets import NetError
+from actors.palletizing.placing import finger_room
+from actors.palletizing.placing.finger_room import Grasp, Gripper
+from actors.palletizing.placing.rows import RIM_M
+from actors.palletizing.simulation.cell.scene import CellLayout
 
 from .spring_arm import ARM, HOME_RAD, SpringArm, pose, run
 

@@ -13,12 +13,12 @@ pytest.importorskip("mujoco", exc_type=ImportError)
 from actors.palletizing import vocabulary as words
 from actors.palletizing.action import Action
 from actors.palletizing.action_generator import ActionGenerator
-from actors.palletizing.demo_lineage import show_packing
-from actors.palletizing.demo_robot_cell import TEMPLATE, configured
-from actors.palletizing.expectation import last_forks
+from actors.palletizing.demo.lineage import show_packing
+from actors.palletizing.demo.robot_cell import TEMPLATE, configured
 from actors.palletizing.feedback import HandlingFeedback
-from actors.palletizing.handling import felt_on
-from actors.palletizing.simulation.cell_scene import CellLayout
+from actors.palletizing.handling.expectation import last_forks
+from actors.palletizing.handling.stages import felt_on
+from actors.palletizing.simulation.cell.scene import CellLayout
 from enact_dist import Lock, View, Write, testing
 from enact_dist.actor.check import check_cell
 from enact_dist.config.read import load_config

@@ -9,13 +9,13 @@ pytest.importorskip("mujoco", exc_type=ImportError)
 from actors.geometry.poses import turned
 from actors.palletizing import vocabulary as words
 from actors.palletizing.deviation import DeviationDetection
-from actors.palletizing.grounding import aside_net
-from actors.palletizing.handling import TAKEN_OUT, UNRECOGNISED
+from actors.palletizing.handling.grounding import aside_net
+from actors.palletizing.handling.nets import Execution
+from actors.palletizing.handling.stages import TAKEN_OUT, UNRECOGNISED
 from actors.palletizing.handling_perception import UNSEEN_LOOKS, EmptyBelt, HandlingPerception
-from actors.palletizing.nets import Execution
 from actors.palletizing.planning import RowPlanning
-from actors.palletizing.sensor import SensorError
-from actors.palletizing.simulation.cell_scene import CellLayout
+from actors.palletizing.sight.sensor import SensorError
+from actors.palletizing.simulation.cell.scene import CellLayout
 from actors.palletizing.simulation.physical_sensors import PhysicalBeltSensor, PhysicalTraySensor
 from actors.palletizing.simulation.physics import PhysicalCell
 from actors.palletizing.training_grasp import TrainingGrasp

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from actors.palletizing import vocabulary as words
-from actors.palletizing.finger_room import Grasp
+from actors.palletizing.placing.finger_room import Grasp
 from enact_dist import View, testing
 from tests.actors.palletizing.sound_nets import net, primitive, way
 

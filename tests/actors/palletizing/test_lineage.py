@@ -7,7 +7,7 @@ import pytest
 pytest.importorskip("open3d", exc_type=ImportError)
 
 from actors.palletizing.conveyor import Conveyor
-from actors.palletizing.demo_lineage import verdict_causes, view_effects
+from actors.palletizing.demo.lineage import verdict_causes, view_effects
 from actors.palletizing.deviation import DeviationDetection
 from actors.palletizing.feedback import Feedback
 from actors.palletizing.fusion import Fusion

@@ -4,8 +4,8 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from actors.palletizing.grounding import FOLDER, SKELETONS
-from actors.palletizing.net_files import write_net
+from actors.palletizing.handling.grounding import FOLDER, SKELETONS
+from actors.palletizing.handling.net_files import write_net
 from enact_dist.cli.main import main
 
 from .sound_nets import net, primitive, way

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import pytest
 
-from actors.palletizing.grounding import SKELETONS
-from actors.palletizing.net_picture import WIDTH, svg_of_net
+from actors.palletizing.handling.grounding import SKELETONS
+from actors.palletizing.handling.net_picture import WIDTH, svg_of_net
 
 from .sound_nets import net, primitive, way
 from .spring_arm import SpringArm, run

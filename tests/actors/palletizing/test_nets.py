@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from actors.palletizing.net_files import net_of_text, read_net, text_of_net, write_net
-from actors.palletizing.nets import Axis, Execution, Net, NetError, TaskFrame, TraceStep
+from actors.palletizing.handling.net_files import net_of_text, read_net, text_of_net, write_net
+from actors.palletizing.handling.nets import Axis, Execution, Net, NetError, TaskFrame, TraceStep
 from enact_dist import Aspect, Entity, Lock, Read, Write
 from enact_dist.world.connecting import local
 

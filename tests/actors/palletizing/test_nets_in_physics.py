@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from actors.geometry.poses import coordinates, on_tray
-from actors.palletizing.execution import Executor
-from actors.palletizing.finger_room import Grasp, Gripper
-from actors.palletizing.grounding import PUSH_GAP_M, Job, easier_turn, ground
-from actors.palletizing.simulation.cell_scene import ARM, HOME_RAD, TABLE_M
+from actors.palletizing.control.execution import Executor
+from actors.palletizing.handling.grounding import PUSH_GAP_M, Job, easier_turn, ground
+from actors.palletizing.placing.finger_room import Grasp, Gripper
+from actors.palletizing.simulation.cell.scene import ARM, HOME_RAD, TABLE_M
 from actors.palletizing.simulation.physics import PhysicalCell
 
 from .moves import carton

@@ -7,19 +7,19 @@ import pytest
 
 from actors.geometry.poses import on_tray
 from actors.geometry.shapes import Surface
-from actors.palletizing.packing import Packing
-from actors.palletizing.packing_records import Packed
-from actors.palletizing.packing_scores import (
+from actors.palletizing.simulation.knocks import Knock
+from actors.palletizing.simulation.packages import DEMO_PRODUCTS
+from actors.palletizing.simulation.physical_packages import Spread, draw_packages
+from actors.palletizing.simulation.products import product_mesh
+from actors.palletizing.trials.packing import Packing
+from actors.palletizing.trials.packing_records import Packed
+from actors.palletizing.trials.packing_scores import (
     Tray,
     confusion,
     missed,
     packed_tray,
     scores_of,
 )
-from actors.palletizing.simulation.knocks import Knock
-from actors.palletizing.simulation.packages import DEMO_PRODUCTS
-from actors.palletizing.simulation.physical_packages import Spread, draw_packages
-from actors.palletizing.simulation.products import product_mesh
 
 pytestmark = pytest.mark.sampled(5, of="file")
 

@@ -5,13 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from actors.geometry.reaching import reach
+from actors.geometry.arms.reaching import reach
 from actors.geometry.shapes import Surface
-from actors.palletizing.finger_room import Grasp
-from actors.palletizing.grasps import grasp_of, size_of
-from actors.palletizing.handling import felt_on, fills, is_held
-from actors.palletizing.handling_data import GripCommand, GripState
-from actors.palletizing.reactions import (
+from actors.palletizing.handling.data import GripCommand, GripState
+from actors.palletizing.handling.reactions import (
     MOST,
     REACTIONS,
     UNFIT_ON_BELT,
@@ -20,8 +17,11 @@ from actors.palletizing.reactions import (
     react,
     worst,
 )
-from actors.palletizing.rows import contacts_between, planned_rows
-from actors.palletizing.simulation.cell_scene import (
+from actors.palletizing.handling.stages import felt_on, fills, is_held
+from actors.palletizing.placing.finger_room import Grasp
+from actors.palletizing.placing.grasps import grasp_of, size_of
+from actors.palletizing.placing.rows import contacts_between, planned_rows
+from actors.palletizing.simulation.cell.scene import (
     ARM,
     HOME_RAD,
     CellLayout,

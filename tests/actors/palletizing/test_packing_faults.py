@@ -18,7 +18,7 @@ import pytest
 pytest.importorskip("open3d", exc_type=ImportError)
 pytest.importorskip("mujoco", exc_type=ImportError)
 
-from actors.palletizing.demo_robot_cell import RunningRobotCell
+from actors.palletizing.demo.robot_cell import RunningRobotCell
 from actors.palletizing.vocabulary import (
     ARRIVAL,
     CONTROL,
@@ -36,7 +36,7 @@ from enact_dist.errors import EnactError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from actors.palletizing.nets import Execution
+    from actors.palletizing.handling.nets import Execution
     from actors.palletizing.vocabulary import Request, Result
     from enact_dist import Aspect, Cell, Entity
 

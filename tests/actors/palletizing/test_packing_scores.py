@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 
 from actors.geometry.poses import on_tray
-from actors.palletizing import packing_scores
-from actors.palletizing.demo_packing_report import row_of
-from actors.palletizing.packing_records import Judgement, Packed, Step, line_of, packed_of
-from actors.palletizing.packing_scores import (
+from actors.palletizing.demo.packing_report import row_of
+from actors.palletizing.simulation.cell.truth import PackageTruth
+from actors.palletizing.simulation.packages import DEMO_PRODUCTS
+from actors.palletizing.simulation.physical_packages import Dent
+from actors.palletizing.trials import packing_scores
+from actors.palletizing.trials.packing_records import Judgement, Packed, Step, line_of, packed_of
+from actors.palletizing.trials.packing_scores import (
     EVERY,
     GOALS,
     Tray,
@@ -20,10 +23,7 @@ from actors.palletizing.packing_scores import (
     scores_of,
     trays_of,
 )
-from actors.palletizing.packing_truth import badness, state_of
-from actors.palletizing.simulation.cell_truth import PackageTruth
-from actors.palletizing.simulation.packages import DEMO_PRODUCTS
-from actors.palletizing.simulation.physical_packages import Dent
+from actors.palletizing.trials.truth import badness, state_of
 from actors.palletizing.vocabulary import Deviation, Plan, Result
 from enact_dist.cli import bench
 from enact_dist.cli.main import main

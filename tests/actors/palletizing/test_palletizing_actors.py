@@ -14,7 +14,7 @@ from actors.palletizing.fusion import Fusion
 from actors.palletizing.perception import OnlinePerception, TrainingPerception
 from actors.palletizing.planning import Planning
 from actors.palletizing.reconstruction import Reconstruction
-from actors.palletizing.sensor import open_sensor
+from actors.palletizing.sight.sensor import open_sensor
 from actors.palletizing.simulation.packages import VERDICT_OF_KIND, package_sequence
 from actors.palletizing.vocabulary import (
     CLOUD,
@@ -267,7 +267,7 @@ def test_feedback_tells_each_verdict_once(cell, capsys):
 
 
 @pytest.mark.parametrize(
-    "address", ["nothing", "actors.nowhere:sensor", "actors.palletizing.sensor:none"]
+    "address", ["nothing", "actors.nowhere:sensor", "actors.palletizing.sight.sensor:none"]
 )
 def test_sensor_address_that_leads_nowhere_is_refused(address):
     """The error shows the address."""

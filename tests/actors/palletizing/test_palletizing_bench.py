@@ -4,9 +4,9 @@ import types
 
 import pytest
 
-from actors.palletizing import packing_scores, perception_scores
-from actors.palletizing.packing_records import Judgement, Packed
-from actors.palletizing.perception_scores import Scored
+from actors.palletizing.trials import packing_scores, perception_scores
+from actors.palletizing.trials.packing_records import Judgement, Packed
+from actors.palletizing.trials.perception_scores import Scored
 from enact_dist.bench.cases.palletizing import run_palletizing
 from enact_dist.bench.run import PackingOptions
 from enact_dist.errors import MisuseError

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from actors.geometry.depth import metres, points_grid
 from actors.geometry.poses import inverse, moved, on_tray
-from actors.geometry.rendering import directions
 from actors.geometry.shapes import VGA
-from actors.palletizing.controller import ControllerError
+from actors.geometry.surfaces.depth import metres, points_grid
+from actors.geometry.surfaces.rendering import directions
+from actors.palletizing.control.controller import ControllerError
 from actors.palletizing.simulation import physical_sensors
-from actors.palletizing.simulation.cell_picture import CellPictures
+from actors.palletizing.simulation.cell.picture import CellPictures
 from actors.palletizing.simulation.packages import Truth, deformed, pressed
 from actors.palletizing.simulation.physical_packages import (
     Damage,

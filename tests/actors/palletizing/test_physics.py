@@ -5,11 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from actors.geometry.kinematics import tool_poses
+from actors.geometry.arms.kinematics import tool_poses
 from actors.geometry.poses import on_tray
-from actors.palletizing.controller import ControllerError
-from actors.palletizing.simulation.cell_arm import CYCLE_S
-from actors.palletizing.simulation.cell_scene import (
+from actors.palletizing.control.controller import ControllerError
+from actors.palletizing.simulation.cell.arm import CYCLE_S
+from actors.palletizing.simulation.cell.scene import (
     ARM,
     BELT_M_S,
     HOME_RAD,

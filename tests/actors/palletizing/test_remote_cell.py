@@ -6,12 +6,12 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from actors.palletizing.controller import ControllerError, open_controller
-from actors.palletizing.sensor import open_sensor
-from actors.palletizing.simulation.cell_messages import receive, send
-from actors.palletizing.simulation.cell_scene import HOME_RAD
-from actors.palletizing.simulation.cell_server import CellServer, main
-from actors.palletizing.simulation.cell_thread import RunningCell
+from actors.palletizing.control.controller import ControllerError, open_controller
+from actors.palletizing.sight.sensor import open_sensor
+from actors.palletizing.simulation.cell.messages import receive, send
+from actors.palletizing.simulation.cell.scene import HOME_RAD
+from actors.palletizing.simulation.cell.server import CellServer, main
+from actors.palletizing.simulation.cell.thread import RunningCell
 from actors.palletizing.simulation.physics import PhysicalCell
 from actors.palletizing.simulation.remote_cell import RemoteCell
 

@@ -11,8 +11,8 @@ import pytest
 
 from actors.palletizing import gripper as gripper_module
 from actors.palletizing import robot
-from actors.palletizing.controller import ArmMeasured, ControllerError, GripperMeasured
-from actors.palletizing.execution import Grip
+from actors.palletizing.control.controller import ArmMeasured, ControllerError, GripperMeasured
+from actors.palletizing.control.execution import Grip
 from actors.palletizing.gripper import Gripper
 from actors.palletizing.robot import Robot, RobotJoints
 from actors.palletizing.vocabulary import (

@@ -5,10 +5,10 @@ import itertools
 import numpy as np
 import pytest
 
-from actors.geometry.kinematics import tool_poses
-from actors.palletizing.controller import ControllerError, open_controller
-from actors.palletizing.simulation.cell_arm import CYCLE_S, DDDQ_MAX, DDQ_MAX, JointLimiter
-from actors.palletizing.simulation.cell_scene import (
+from actors.geometry.arms.kinematics import tool_poses
+from actors.palletizing.control.controller import ControllerError, open_controller
+from actors.palletizing.simulation.cell.arm import CYCLE_S, DDDQ_MAX, DDQ_MAX, JointLimiter
+from actors.palletizing.simulation.cell.scene import (
     ARM,
     HOME_RAD,
 )
@@ -156,7 +156,7 @@ def test_impossible_commands_are_one_line():
     [
         ("actors.palletizing", "is no controller; write MODULE:FUNCTION"),
         ("actors.palletizing.nowhere:arm", "no controller at"),
-        ("actors.palletizing.controller:ControllerError?hue=3", "refuses its values"),
+        ("actors.palletizing.control.controller:ControllerError?hue=3", "refuses its values"),
     ],
 )
 def test_wrong_addresses_are_one_line(address, text):

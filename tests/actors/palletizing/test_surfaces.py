@@ -7,15 +7,15 @@ o3d = pytest.importorskip("open3d", exc_type=ImportError)
 
 from scipy.ndimage import binary_erosion  # noqa: E402
 
-from actors.geometry.depth import points_grid  # noqa: E402
-from actors.geometry.depth_reconstruction import reconstruct_view  # noqa: E402
-from actors.geometry.deviation import inspect_place  # noqa: E402
-from actors.geometry.fusion import fuse_views, refined_poses  # noqa: E402
 from actors.geometry.poses import inverse, moved, on_tray, small_motion, yaw_between, yaw_of  # noqa: E402
-from actors.geometry.registration import register  # noqa: E402
-from actors.geometry.rendering import ray_scene, render_depth  # noqa: E402
-from actors.geometry.segmentation import assigned, new_pieces, product_on_plate  # noqa: E402
+from actors.geometry.recognition.deviation import inspect_place  # noqa: E402
+from actors.geometry.recognition.registration import register  # noqa: E402
+from actors.geometry.recognition.segmentation import assigned, new_pieces, product_on_plate  # noqa: E402
 from actors.geometry.shapes import FREE_FORM, VGA, Acquisition, PointCloud, Surface  # noqa: E402
+from actors.geometry.surfaces.depth import points_grid  # noqa: E402
+from actors.geometry.surfaces.depth_reconstruction import reconstruct_view  # noqa: E402
+from actors.geometry.surfaces.fusion import fuse_views, refined_poses  # noqa: E402
+from actors.geometry.surfaces.rendering import ray_scene, render_depth  # noqa: E402
 from actors.palletizing.simulation.products import product_mesh  # noqa: E402
 from actors.palletizing.simulation.sensors import SimulatedOrbitSensor  # noqa: E402
 

@@ -5,13 +5,13 @@ import pytest
 
 pytest.importorskip("open3d", exc_type=ImportError)
 
-from actors.geometry.deviation import inspect_place
 from actors.geometry.poses import moved, on_tray
+from actors.geometry.recognition.deviation import inspect_place
+from actors.palletizing.sight.tray_changes import where_seen
+from actors.palletizing.sight.tray_watch import Seen, TrayWatch
 from actors.palletizing.simulation.packages import pressed
 from actors.palletizing.simulation.products import box_mesh, product_mesh
 from actors.palletizing.simulation.sensors import shifted
-from actors.palletizing.tray_changes import where_seen
-from actors.palletizing.tray_watch import Seen, TrayWatch
 
 from .tray_pictures import looked_at
 

@@ -6,8 +6,8 @@ import threading
 
 import pytest
 
-from actors.palletizing import urgency
-from actors.palletizing.urgency import NICE, SWITCH_S, make_urgent
+from actors.palletizing.control import urgency
+from actors.palletizing.control.urgency import NICE, SWITCH_S, make_urgent
 
 
 @pytest.fixture

@@ -7,13 +7,13 @@ import pytest
 
 pytest.importorskip("open3d", exc_type=ImportError)
 
-from actors.geometry.deviation import inspect_place
 from actors.geometry.open3d_arrays import tensor
 from actors.geometry.poses import moved, on_tray, small_motion
-from actors.geometry.rendering import ray_scene
+from actors.geometry.recognition.deviation import inspect_place
 from actors.geometry.shapes import Surface
-from actors.palletizing.evaluation import graded, judge
-from actors.palletizing.rows import contacts_between
+from actors.geometry.surfaces.rendering import ray_scene
+from actors.palletizing.placing.rows import contacts_between
+from actors.palletizing.sight.tray_changes import without
 from actors.palletizing.simulation.packages import (
     FACE_DENT,
     KINDS,
@@ -25,7 +25,7 @@ from actors.palletizing.simulation.packages import (
 )
 from actors.palletizing.simulation.products import product_mesh
 from actors.palletizing.simulation.sensors import SimulatedTraySensor
-from actors.palletizing.tray_changes import without
+from actors.palletizing.trials.evaluation import graded, judge
 
 from .tray_pictures import looked_at
 

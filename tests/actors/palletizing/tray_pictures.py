@@ -4,7 +4,7 @@ import numpy as np
 
 from actors.geometry.poses import moved
 from actors.geometry.shapes import VGA, Acquisition, DepthFrame
-from actors.palletizing.sensor import steady
+from actors.palletizing.sight.sensor import steady
 from actors.palletizing.simulation.noise import sensed
 from actors.palletizing.simulation.products import product_mesh
 from actors.palletizing.simulation.sensors import looking_down, tray_meshes, true_depth

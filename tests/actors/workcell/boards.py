@@ -5,7 +5,7 @@ import functools
 import cv2
 import numpy as np
 
-from actors.geometry.charuco import board_of
+from actors.geometry.cameras.charuco import board_of
 
 BOARD = board_of("7x5,0.08,0.06,4X4_50")
 SIZE = (640, 480)

@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from actors.geometry.arms.kinematics import capsules_at
 from actors.geometry.capsules import distance_to_points
-from actors.geometry.kinematics import capsules_at
 from actors.workcell import vocabulary as words
 from actors.workcell.scenarios import scenario_of
+from actors.workcell.scores.trace import ONLINE, TRUTH, Kept, Trace
 from actors.workcell.simulation.arm import ARM, HOME_RAD
 from actors.workcell.simulation.human import Person
-from actors.workcell.trace import ONLINE, TRUTH, Kept, Trace
 
 if TYPE_CHECKING:
     from enact_dist import Aspect

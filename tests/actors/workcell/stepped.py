@@ -14,17 +14,17 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from actors.geometry.visibility import camera_table
+from actors.geometry.hull.visibility import camera_table
 from actors.workcell import reconstruction, robot, setup
 from actors.workcell import vocabulary as words
-from actors.workcell.demo_cell import SETUP, TEMPLATE
+from actors.workcell.demo.cell import SETUP, TEMPLATE
 from actors.workcell.motion import CYCLE_S, Motion
 from actors.workcell.scenarios import scenario_of
+from actors.workcell.scores.trace import ASPECTS, ONLINE, RECORDED, TRUTH, Kept, Trace
 from actors.workcell.simulation.camera import SimulatedCamera
-from actors.workcell.simulation.render import View as Room
+from actors.workcell.simulation.drawing.render import View as Room
 from actors.workcell.simulation.room import cameras
 from actors.workcell.simulation.sources import LiveSource
-from actors.workcell.trace import ASPECTS, ONLINE, RECORDED, TRUTH, Kept, Trace
 from enact_dist import Lock, View, Write, testing
 from enact_dist.actor.running.load import configured_actor
 from enact_dist.config.read import load_config
@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 
     import pytest
 
-    from actors.geometry.voxels import VoxelBlocks
-    from actors.workcell.sources import CameraSource
+    from actors.geometry.hull.voxels import VoxelBlocks
+    from actors.workcell.cameras.sources import CameraSource
     from actors.workcell.vocabulary import ArmModel, Calibration
     from enact_dist import Actor, Cell
     from enact_dist.config.types import ActorConfig

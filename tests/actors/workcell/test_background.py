@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from actors.geometry.arms.kinematics import capsules_at
 from actors.geometry.capsules import fill, outlines
-from actors.geometry.kinematics import capsules_at
-from actors.geometry.silhouettes import unpacked
+from actors.geometry.hull.silhouettes import unpacked
 from actors.workcell.background import BackgroundLearning, BackgroundSubtraction, checksum
+from actors.workcell.cameras.sources import source_of
 from actors.workcell.simulation.arm import ARM
 from actors.workcell.smart_camera import SmartCamera
-from actors.workcell.sources import source_of
 from actors.workcell.vocabulary import (
     BACKGROUND,
     CALIBRATION,

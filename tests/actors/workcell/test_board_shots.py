@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from actors.geometry.charuco import find_board
-from actors.workcell.board_shots import opened_sources, take_shots
-from actors.workcell.sources import CameraError
+from actors.geometry.cameras.charuco import find_board
+from actors.workcell.cameras.board_shots import opened_sources, take_shots
+from actors.workcell.cameras.sources import CameraError
 
 from . import boards
 from .boards import BOARD, CAMERAS, moments

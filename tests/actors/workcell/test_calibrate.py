@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 import pytest
 
-from actors.geometry.board_sheet import rectangles, sheet
-from actors.geometry.camera_sets import read_cameras
-from actors.geometry.charuco import board_of, find_board
+from actors.geometry.cameras.board_sheet import rectangles, sheet
+from actors.geometry.cameras.camera_sets import read_cameras
+from actors.geometry.cameras.charuco import board_of, find_board
 from actors.geometry.files import InputFileError
-from actors.workcell.calibrate import CalibrateOptions, calibrate
+from actors.workcell.folders.calibrate import CalibrateOptions, calibrate
 
 from . import boards
 from .boards import BOARD, CAMERAS, DISTORTION, lens, moments

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from actors.geometry.bundle_adjustment import Lens, Rig, Sight, adjusted, projected
-from actors.geometry.camera_calibration import (
+from actors.geometry.cameras.bundle_adjustment import Lens, Rig, Sight, adjusted, projected
+from actors.geometry.cameras.camera_calibration import (
     UnfitPicturesError,
     calibrated,
     chosen_origin,

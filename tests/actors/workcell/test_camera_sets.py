@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors.geometry.camera_sets import decomposed, read_cameras
+from actors.geometry.cameras.camera_sets import decomposed, read_cameras
 from actors.geometry.files import InputFileError
 
 from . import turntable

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from actors.workcell.camera import Camera, Capture
-from actors.workcell.simulation.room import cameras
-from actors.workcell.sources import (
+from actors.workcell.cameras.sources import (
     PERIOD_NS,
     CameraEndedError,
     CameraError,
     source_of,
 )
+from actors.workcell.simulation.room import cameras
 from actors.workcell.vocabulary import CALIBRATION, IMAGE, camera_entity
 from enact_dist import Lock, View, testing
 

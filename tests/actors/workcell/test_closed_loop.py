@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from actors.workcell import vocabulary as words
-from actors.workcell.closed_loop import LATENCY_S, ClosedLoop, Sight
-from actors.workcell.evaluation import samples_of, scores_of
 from actors.workcell.scenarios import Pause, Walk, scenario_of
-from actors.workcell.simulation.backdrop import backdrop_of
+from actors.workcell.scores.closed_loop import LATENCY_S, ClosedLoop, Sight
+from actors.workcell.scores.evaluation import samples_of, scores_of
+from actors.workcell.scores.true_hull import capsules_in
+from actors.workcell.scores.truth_of_run import share_of, truth_of
+from actors.workcell.simulation.drawing.backdrop import backdrop_of
 from actors.workcell.simulation.room import BOXES, Box, cameras
-from actors.workcell.true_hull import capsules_in
-from actors.workcell.truth_of_run import share_of, truth_of
 
 pytest.importorskip("cv2", exc_type=ImportError)
 pytest.importorskip("ompl", exc_type=ImportError)

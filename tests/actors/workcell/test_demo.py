@@ -21,25 +21,26 @@ pytest.importorskip("mcap", exc_type=ImportError)
 
 from actors import running_cell
 from actors.running_cell import DemoCell, DemoError
-from actors.workcell import demo_cell, demo_conduct
 from actors.workcell import vocabulary as words
-from actors.workcell.demo import run_quietly
-from actors.workcell.demo_cell import configured
-from actors.workcell.demo_conduct import Conductor, Notes, recording, told
-from actors.workcell.demo_options import Options
-from actors.workcell.demo_report import (
+from actors.workcell.demo import cell as demo_cell
+from actors.workcell.demo import conduct as demo_conduct
+from actors.workcell.demo.cell import configured
+from actors.workcell.demo.conduct import Conductor, Notes, recording, told
+from actors.workcell.demo.options import Options
+from actors.workcell.demo.report import (
     report_of,
     show_lineage,
     show_past,
     stop_checks,
     value_text,
 )
-from actors.workcell.demo_what_if import in_both
+from actors.workcell.demo.run import run_quietly
+from actors.workcell.demo.unshared import PlainEach, PlainLock, Version
+from actors.workcell.demo.what_if import in_both
 from actors.workcell.scenarios import Fault, scenario_of
+from actors.workcell.scores.trace import ASPECTS, trace_of
 from actors.workcell.setup import Setup
 from actors.workcell.simulation.truth import TruthHuman
-from actors.workcell.trace import ASPECTS, trace_of
-from actors.workcell.unshared import PlainEach, PlainLock, Version
 from enact_dist import Aspect, Entity, Lock, View, Write, local, testing
 from enact_dist.actor.running.commands import ACTOR, COMMANDS
 from enact_dist.errors import ConfigError, MisuseError

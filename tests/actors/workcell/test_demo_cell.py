@@ -10,10 +10,10 @@ pytest.importorskip("mcap", exc_type=ImportError)
 
 from actors.running_cell import toml_of
 from actors.workcell import vocabulary as words
-from actors.workcell.demo_cell import TEMPLATE, configured
-from actors.workcell.demo_options import Options
-from actors.workcell.figures import figure4
+from actors.workcell.demo.cell import TEMPLATE, configured
+from actors.workcell.demo.options import Options
 from actors.workcell.scenarios import scenario_of
+from actors.workcell.scores.figures import figure4
 from actors.workcell.setup import Setup, grid_of
 from enact_dist import testing
 from enact_dist.actor.check import check_cell, declarations_of

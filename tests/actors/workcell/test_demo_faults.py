@@ -20,12 +20,12 @@ pytest.importorskip("cv2", exc_type=ImportError)
 pytest.importorskip("mcap", exc_type=ImportError)
 
 from actors.workcell import vocabulary as words
-from actors.workcell.demo_cell import RunningCell
-from actors.workcell.demo_conduct import Conductor, recording
-from actors.workcell.demo_options import Options
-from actors.workcell.scenario_checks import checks_of
-from actors.workcell.trace import RECORDED, trace_of
-from actors.workcell.truth_of_run import too_fast_of, truth_of
+from actors.workcell.demo.cell import RunningCell
+from actors.workcell.demo.conduct import Conductor, recording
+from actors.workcell.demo.options import Options
+from actors.workcell.scores.scenario_checks import checks_of
+from actors.workcell.scores.trace import RECORDED, trace_of
+from actors.workcell.scores.truth_of_run import too_fast_of, truth_of
 from actors.workcell.watch import SILENT
 from enact_dist import Aspect, Entity, Lock, Write
 from enact_dist.errors import EnactError

@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from actors.geometry.kinematics import capsules_at
+from actors.geometry.arms.kinematics import capsules_at
 from actors.workcell import vocabulary as words
-from actors.workcell.evaluation import GOALS, _latencies, along, missed, score
+from actors.workcell.scores.evaluation import GOALS, _latencies, along, missed, score
+from actors.workcell.scores.trace import ONLINE, Kept
+from actors.workcell.scores.truth_of_run import truth_of
 from actors.workcell.simulation.arm import ARM
 from actors.workcell.simulation.human import Person
-from actors.workcell.trace import ONLINE, Kept
-from actors.workcell.truth_of_run import truth_of
 from enact_dist.errors import ConfigError
 
 from .runs import GRID, PERIOD_NS, START_NS, Run

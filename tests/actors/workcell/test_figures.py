@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from actors.workcell import figures, plots
 from actors.workcell import vocabulary as words
-from actors.workcell.figures import CHANGED, SAME, masks_figure, scene_picture, voxel_points
-from actors.workcell.truth_of_run import truth_of
+from actors.workcell.scores import figures, plots
+from actors.workcell.scores.figures import CHANGED, SAME, masks_figure, scene_picture, voxel_points
+from actors.workcell.scores.truth_of_run import truth_of
 from actors.workcell.vocabulary import LIMBS, SILHOUETTE, TRACK, Grid, Silhouette, Track
 
 from .runs import Run

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from actors.geometry.camera_sets import SetCamera
-from actors.geometry.space_carving import (
+from actors.geometry.cameras.camera_sets import SetCamera
+from actors.geometry.hull.space_carving import (
     Carver,
     found_bounds,
     grid_of,
@@ -16,9 +16,9 @@ from actors.geometry.space_carving import (
     intersection_over_union,
     nearest_to_axes,
 )
-from actors.geometry.voxel_surface import surface_of, voxel_surface
-from actors.workcell.folder_pictures import colour_of
-from actors.workcell.folders import FolderOptions, run_folder
+from actors.geometry.hull.voxel_surface import surface_of, voxel_surface
+from actors.workcell.folders.pictures import colour_of
+from actors.workcell.folders.run import FolderOptions, run_folder
 from enact_dist.cli.main import main
 
 from . import turntable
@@ -86,7 +86,7 @@ def test_looking_at_blocks_first_changes_nothing(carver, box, monkeypatch):
     """But the time."""
     grid = grid_of(*box, 64)
     quick = carver.carve(grid)
-    monkeypatch.setattr("actors.geometry.space_carving.WHOLE_MAX", 1 << 60)
+    monkeypatch.setattr("actors.geometry.hull.space_carving.WHOLE_MAX", 1 << 60)
     slow = carver.carve(grid)
     assert np.array_equal(quick.rows, slow.rows)
     assert np.array_equal(quick.tight_rows, slow.tight_rows)
@@ -318,8 +318,8 @@ def test_what_is_wrong_is_one_line_and_nothing_is_written(folder, capsys, name):
 
 def test_actors_that_make_no_hull_are_one_line(folder, capsys, monkeypatch):
     """Here what the cameras saw never reaches them."""
-    monkeypatch.setattr("actors.workcell.folder_cell._write", lambda *_: None)
-    monkeypatch.setattr("actors.workcell.folder_cell.HULL_S", 0.1)
+    monkeypatch.setattr("actors.workcell.folders.cell._write", lambda *_: None)
+    monkeypatch.setattr("actors.workcell.folders.cell.HULL_S", 0.1)
     status, report, err = run(folder, capsys)
     assert (status, report) == (1, None)
     assert "no hull of 8 pictures" in err
@@ -338,7 +338,7 @@ def test_missing_picture_is_told_and_the_others_are_used(folder, capsys):
 def test_very_many_voxels_are_carved_without_tables(folder, capsys, monkeypatch):
     """The result is the same but for what the refinement takes for noise."""
     _, by_actors, _ = run(folder, capsys)
-    monkeypatch.setattr("actors.workcell.folder_cell.TABLES_BYTES_MAX", 0)
+    monkeypatch.setattr("actors.workcell.folders.cell.TABLES_BYTES_MAX", 0)
     _, carved, _ = run(folder, capsys)
     assert carved["made_by"] == "carving, voxel by voxel"
     assert np.isclose(carved["volume_l"], by_actors["volume_l"], rtol=0.05)

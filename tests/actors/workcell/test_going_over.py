@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors.geometry.joint_paths import JoinedPath, JointPath, PathFollower, PathSpeeds
-from actors.geometry.kinematics import end_velocities
+from actors.geometry.arms.joint_paths import JoinedPath, JointPath, PathFollower, PathSpeeds
+from actors.geometry.arms.kinematics import end_velocities
 from actors.workcell.motion import BRAKING_M_S2, CYCLE_S, NOMINAL_M_S, Motion
 from actors.workcell.simulation.arm import ARM
 from actors.workcell.vocabulary import NO_PATH, Path, Speed

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors.geometry.joint_paths import JointPath, PathFollower, PathSpeeds
-from actors.geometry.kinematics import capsules_at
+from actors.geometry.arms.joint_paths import JointPath, PathFollower, PathSpeeds
+from actors.geometry.arms.kinematics import capsules_at
 from actors.workcell.simulation.arm import ARM
 
 BRAKING_M_S2 = 6.0

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from actors.geometry.arm_clearance import ArmSpheres, CellGrid, Clearance, GrownGrid
+from actors.geometry.arms.clearance import ArmSpheres, CellGrid, Clearance, GrownGrid
+from actors.geometry.arms.joint_paths import JointPath
+from actors.geometry.arms.joint_planning import plan, shortened
+from actors.geometry.arms.kinematics import capsules_at
 from actors.geometry.capsules import capsule_distances, distance_to_points
-from actors.geometry.joint_paths import JointPath
-from actors.geometry.joint_planning import plan, shortened
-from actors.geometry.kinematics import capsules_at
 from actors.workcell.simulation.arm import ARM
 
 LEFT = np.array([-1.0, 0.9, 0.0, -1.1, 0.0, 1.1, 0.0])

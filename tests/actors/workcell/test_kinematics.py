@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from actors.geometry.kinematics import (
+from actors.geometry.arms.kinematics import (
     capsules_at,
     end_velocities,
     jacobians,

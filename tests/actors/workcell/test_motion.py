@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
+from actors.geometry.arms.kinematics import capsules_at, end_velocities
 from actors.geometry.capsules import capsule_distances
-from actors.geometry.kinematics import capsules_at, end_velocities
 from actors.geometry.separation import Reaction, Separation
 from actors.workcell.motion import (
     BRAKING_M_S2,

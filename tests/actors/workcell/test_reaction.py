@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from actors.workcell import vocabulary as words
-from actors.workcell.demo_what_if import WhatIf, along_s, legs_s
+from actors.workcell.demo.what_if import WhatIf, along_s, legs_s
 from actors.workcell.motion import NOMINAL_M_S
-from actors.workcell.reaction import after_ms, reaction_of
+from actors.workcell.scores.reaction import after_ms, reaction_of
+from actors.workcell.scores.truth_of_run import truth_of
 from actors.workcell.simulation.arm import ARM, HOME_RAD
-from actors.workcell.truth_of_run import truth_of
 
 from .runs import PERIOD_NS, START_NS, Run
 

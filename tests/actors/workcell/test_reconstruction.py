@@ -9,10 +9,10 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
+from actors.geometry.arms.kinematics import capsules_at
 from actors.geometry.capsules import distance_between, distance_to_points, fill, outlines
-from actors.geometry.kinematics import capsules_at
+from actors.geometry.hull.silhouettes import packed
 from actors.geometry.shapes import Surface
-from actors.geometry.silhouettes import packed
 from actors.workcell.reconstruction import AHEAD_NS_MAX, Reconstruction, joints_at
 from actors.workcell.simulation.arm import ARM
 from actors.workcell.simulation.room import BOXES as ROOM

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from actors.workcell import vocabulary as words
-from actors.workcell.scenario_checks import NEEDED, checks_of
 from actors.workcell.scenarios import SCENARIOS
+from actors.workcell.scores.scenario_checks import NEEDED, checks_of
 
 from .runs import PERIOD_NS, START_NS, Run
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from actors.geometry.shapes import Camera
-from actors.geometry.static_shapes import static_shapes
+from actors.geometry.surfaces.static_shapes import static_shapes
 from actors.workcell.shapes import ShapeReconstruction, frames_of
 from actors.workcell.simulation.room import BOXES
 from actors.workcell.simulation.scan import scan_of_room

@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
+from actors.geometry.arms.kinematics import capsules_at, tool_poses
 from actors.geometry.capsules import bounds
-from actors.geometry.kinematics import capsules_at, tool_poses
 from actors.workcell.scenarios import SCENARIOS, Pause, Walk, scenario_of
 from actors.workcell.simulation.arm import ARM, BASE_HEIGHT_M, HOME_RAD
 from actors.workcell.simulation.human import CAPSULES, HEAD, RIGHT_HAND, Person, Posture, body

@@ -11,19 +11,19 @@ import cv2
 import numpy as np
 import pytest
 
-from actors.geometry.kinematics import capsules_at
-from actors.workcell.demo_options import Options
+from actors.geometry.arms.kinematics import capsules_at
+from actors.workcell.cameras.sources import FRAME_S, PERIOD_NS, CameraError, source_of
+from actors.workcell.demo.options import Options
 from actors.workcell.scenarios import scenario_of
 from actors.workcell.simulation import sources
 from actors.workcell.simulation.arm import ARM, HOME_RAD, shown_at
-from actors.workcell.simulation.backdrop import backdrop_of
 from actors.workcell.simulation.camera import SimulatedCamera
+from actors.workcell.simulation.drawing.backdrop import backdrop_of
+from actors.workcell.simulation.drawing.render import NOISE_LEVELS
 from actors.workcell.simulation.recording import kept_recording, read_info, record
-from actors.workcell.simulation.render import NOISE_LEVELS
 from actors.workcell.simulation.room import cameras
 from actors.workcell.simulation.stage import Stage
 from actors.workcell.simulation.truth import TruthHuman, TruthRobot
-from actors.workcell.sources import FRAME_S, PERIOD_NS, CameraError, source_of
 from actors.workcell.vocabulary import (
     BODY,
     CALIBRATION,
@@ -124,7 +124,7 @@ def test_scenario_must_begin_at_a_tick():
 
 def test_without_numba_a_simulated_camera_says_what_to_install(monkeypatch):
     """The error names the camera and the extra."""
-    monkeypatch.setitem(sys.modules, "actors.workcell.simulation.kernels", None)
+    monkeypatch.setitem(sys.modules, "actors.workcell.simulation.drawing.kernels", None)
     with pytest.raises(CameraError, match=r"camera/0: .*install the extra workcell"):
         opened("live", None)
 
@@ -320,8 +320,8 @@ def test_mujoco_draws_the_same_scene_or_says_why_not():
     """Where MuJoCo can draw, arm and people stand where the composite renderer puts them."""
     if importlib.util.find_spec("mujoco") is None:
         pytest.skip("MuJoCo is not installed")
-    from actors.workcell.simulation.mujoco_views import mujoco_draws
-    from actors.workcell.simulation.render import View as Composite
+    from actors.workcell.simulation.drawing.mujoco_views import mujoco_draws
+    from actors.workcell.simulation.drawing.render import View as Composite
 
     stage = Stage(scenario_of("visit", 3, 8.0))
     draw = mujoco_draws(VIEWS, stage)[1]
@@ -389,7 +389,7 @@ def test_opening_draws_all_rooms_of_the_scenario(monkeypatch):
     """A frame has one second; the rooms of a walk-in cabinet, and of a box that is left, take it."""
     drawn = []
     monkeypatch.setattr(
-        "actors.workcell.simulation.render.backdrop_of",
+        "actors.workcell.simulation.drawing.render.backdrop_of",
         lambda *_: drawn.append(1) or backdrop_of(*_),
     )
     for name, rooms in (("S4", 2), ("S6", 2)):  # S4: without and with the cabinet

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
+from actors.geometry.arms.kinematics import capsules_at
 from actors.geometry.capsules import fill, outlines
-from actors.geometry.kinematics import capsules_at
 from actors.workcell.scenarios import scenario_of
 from actors.workcell.simulation.arm import ARM, HOME_RAD
-from actors.workcell.simulation.render import NOISE_LEVELS, View
+from actors.workcell.simulation.drawing.render import NOISE_LEVELS, View
 from actors.workcell.simulation.room import BOXES, LAMP_M, cameras
 from actors.workcell.simulation.stage import Stage
 
@@ -76,7 +76,7 @@ def test_outline_and_depth_of_a_sphere_are_exact(number):
 @pytest.mark.parametrize("ends", [(2.0, 3.0), (3.0, 2.0)])
 def test_a_capsule_seen_along_its_axis_shows_its_nearer_end(ends):
     """In whichever order its ends are given."""
-    from actors.workcell.simulation.kernels import draw
+    from actors.workcell.simulation.drawing.kernels import draw
 
     depth_m = np.full((1, 1), np.inf, np.float32)
     capsule = np.array([[ends[0], 0.0, 0.0, ends[1], 0.0, 0.0, 0.1]])

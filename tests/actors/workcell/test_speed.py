@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from actors.geometry.arms.kinematics import capsules_at
 from actors.geometry.capsules import bounds
-from actors.geometry.kinematics import capsules_at
 from actors.geometry.separation import Separation
 from actors.workcell.motion import NOMINAL_M_S, ROBOT_S
 from actors.workcell.simulation.arm import ARM, HOME_RAD

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import pytest
 
 from actors.workcell import vocabulary as words
-from actors.workcell.demo_conduct import DEPTH, Notes
-from actors.workcell.demo_report import stop_checks
-from actors.workcell.evaluation import score
+from actors.workcell.demo.conduct import DEPTH, Notes
+from actors.workcell.demo.report import stop_checks
 from actors.workcell.planning import PathPlanning
-from actors.workcell.scenario_checks import checks_of
+from actors.workcell.scores.evaluation import score
+from actors.workcell.scores.scenario_checks import checks_of
 from enact_dist import Lock, View, Write, testing
 
 from . import stepped as stepping

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
+from actors.workcell.cameras.sources import CameraError, source_of
+from actors.workcell.cameras.video import driver_ns
 from actors.workcell.simulation.room import cameras
-from actors.workcell.sources import CameraError, source_of
-from actors.workcell.video import driver_ns
 
 CALIBRATION = cameras(0.1)[0]  # 64 x 48
 

@@ -9,7 +9,7 @@ import json
 import cv2
 import numpy as np
 
-from actors.geometry.camera_sets import SetCamera
+from actors.geometry.cameras.camera_sets import SetCamera
 
 BALLS = (((0.05, 0.02, 0.12), 0.14), ((-0.07, 0.05, 0.26), 0.08))
 BOX = ((-0.05, -0.22, 0.0), (0.17, -0.05, 0.10))

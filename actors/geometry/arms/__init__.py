@@ -1,0 +1,1 @@
+"""Arms: their kinematics, paths of their joints, and what they touch."""

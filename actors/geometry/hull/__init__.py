@@ -1,0 +1,1 @@
+"""The visual hull of a workspace: silhouettes, voxels, and what is known of them."""

@@ -1,0 +1,1 @@
+"""Known objects in measurements: where they are, and how they deviate."""

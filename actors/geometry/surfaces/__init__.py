@@ -1,0 +1,1 @@
+"""Surfaces from depth images: points, fusion, rendering, distances."""

@@ -1,0 +1,1 @@
+"""Control of the arm, the gripper and the belt: nets executed in a fast loop."""

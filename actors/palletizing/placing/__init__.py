@@ -1,0 +1,1 @@
+"""Places on the pallet: rows, room for the fingers, and grasps."""

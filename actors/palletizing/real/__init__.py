@@ -1,0 +1,1 @@
+"""Palletizing from recordings of a real camera."""

@@ -1,0 +1,1 @@
+"""What the sensors of the tray and the belt see."""

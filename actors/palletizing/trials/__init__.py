@@ -1,0 +1,1 @@
+"""Trials in simulated time, and how well the cell did in them."""

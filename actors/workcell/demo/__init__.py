@@ -1,0 +1,1 @@
+"""The demo of the workcell: all processes, conducted, recorded and reported."""

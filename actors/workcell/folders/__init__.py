@@ -1,0 +1,1 @@
+"""Calibrated pictures in folders: a cell without live cameras."""

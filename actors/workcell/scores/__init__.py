@@ -1,0 +1,1 @@
+"""Runs in simulated time and recordings of runs, scored on their truth."""

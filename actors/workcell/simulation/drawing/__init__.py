@@ -1,0 +1,1 @@
+"""Images of the simulated room: what a camera would see of it."""
