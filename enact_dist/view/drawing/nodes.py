@@ -70,10 +70,11 @@ class AxesNode(Node):
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class TrailNode(Node):
+class LineNode(Node):
     """A line through places (N, 3), N > 1."""
 
     places_m: NDArray[np.float32]
+    colour: Colour
 
 
 @dataclass(frozen=True, eq=False, slots=True)

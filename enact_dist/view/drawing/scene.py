@@ -16,6 +16,7 @@ from enact_dist.recording.drawing.drawables import (
     ShownJoints,
     ShownMesh,
     ShownPose,
+    ShownTrajectory,
     ShownTransform,
     ShownVoxels,
     drawables_of,
@@ -29,6 +30,7 @@ from enact_dist.view.drawing.nodes import (
     CubesNode,
     FrustumNode,
     LabelNode,
+    LineNode,
     Node,
     PointsNode,
     SurfaceNode,
@@ -51,6 +53,8 @@ if TYPE_CHECKING:
 POINTS_MAX: Final = 100_000
 """Points of a larger cloud are thinned; the page says so."""
 TRIANGLES_MAX: Final = 300_000
+PLACES_MAX: Final = 10_000
+"""Places of a longer path are thinned."""
 CUBES_MAX: Final = 1_000
 """More voxels than this are drawn as square points."""
 VARIANTS_MAX: Final = 4
@@ -58,8 +62,8 @@ VARIANTS_MAX: Final = 4
 FIELD_RAD: Final = math.radians(50.0)
 """Vertical field of an image whose camera is not known."""
 IN_SCENE: Final = frozenset(
-    ("image", "mask", "point_cloud", "mesh", "voxels", "capsules", "pose", "transform",
-     "calibration", "joints")
+    ("image", "mask", "point_cloud", "mesh", "voxels", "capsules", "pose",
+     "trajectory", "transform", "calibration", "joints")
 )  # fmt: skip
 """Kinds of `enact_dist.config.shows` that the scene shows; the others are values in the tree."""
 CLOUD_COLOUR: Final = (60, 90, 140)
@@ -67,6 +71,7 @@ MESH_COLOUR: Final = (170, 172, 180)
 VOXEL_COLOUR: Final = (242, 140, 38)
 CAPSULE_COLOUR: Final = (64, 128, 217)
 ARM_COLOUR: Final = (225, 120, 20)
+PATH_COLOUR: Final = (215, 40, 130)
 FRUSTUM_COLOUR: Final = (40, 40, 40)
 
 
@@ -143,6 +148,8 @@ def scene_of(
             if made is not None:
                 nodes[f"{slot}#{kind}"] = made
             remarks += _thinned(slot, drawable, made)
+            if drawable is None:
+                remarks.append(f"{slot} v{shown.recorded.version} does not fit the kind {kind}")
     for camera in _cameras(data, tints).values():
         nodes[f"{camera.parts[0].recorded.slot}#camera"] = _frustum(camera)
         remarks += camera.remarks
@@ -205,6 +212,12 @@ def _node(frame: str, drawable: Drawable | None, tint: Colour | None) -> Node | 
         return CapsulesNode(frame, drawable.capsules, tint or CAPSULE_COLOUR)
     if isinstance(drawable, ShownPose):
         return AxesNode(frame, drawable.matrix, tint)
+    if isinstance(drawable, ShownTrajectory) and len(drawable.places_m) > 1:
+        places_m = drawable.places_m
+        step = -(-len(places_m) // PLACES_MAX)
+        with np.errstate(over="ignore"):
+            kept = np.concatenate((places_m[:-1:step], places_m[-1:])).astype(np.float32)
+        return LineNode(frame, kept, tint or PATH_COLOUR) if np.isfinite(kept).all() else None
     return None
 
 
@@ -248,6 +261,10 @@ def _thinned(slot: Slot, drawable: Drawable | None, node: Node | None) -> Iterat
         yield f"{slot} has more than {POINTS_MAX} points; one in {node.one_in} is shown"
     if isinstance(drawable, ShownMesh) and len(drawable.triangles) > TRIANGLES_MAX:
         yield f"{slot} has {len(drawable.triangles)} triangles; {TRIANGLES_MAX} are shown"
+    if isinstance(drawable, ShownTrajectory) and isinstance(node, LineNode):
+        count, kept = len(drawable.places_m), len(node.places_m)
+        if kept < count:
+            yield f"{slot} has {count} places; a line through {kept} of them is shown"
 
 
 # ---------------------------------------------------------------- cameras
@@ -358,6 +375,8 @@ def _places(node: Node) -> NDArray[np.float64]:
         found = np.asarray(node.points_m, np.float64)
     elif isinstance(node, SurfaceNode):
         found = np.asarray(node.vertices_m, np.float64)
+    elif isinstance(node, LineNode):
+        found = np.asarray(node.places_m, np.float64)
     elif isinstance(node, CubesNode):
         found = np.asarray(node.centres_m, np.float64)
     elif isinstance(node, AxesNode):

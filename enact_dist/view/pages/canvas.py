@@ -16,10 +16,10 @@ from enact_dist.view.drawing.nodes import (
     CubesNode,
     FrustumNode,
     LabelNode,
+    LineNode,
     Node,
     PointsNode,
     SurfaceNode,
-    TrailNode,
 )
 from enact_dist.view.drawing.shapes import (
     CUBE,
@@ -43,7 +43,6 @@ if TYPE_CHECKING:
 JPEG_QUALITY: Final = 75
 _FROM: Final = np.array((0.75, -0.75, 0.6))
 """From where a page looks, in sizes of the scene."""
-TRAIL_COLOUR: Final = (120, 60, 160)
 
 
 class Canvas:
@@ -253,12 +252,12 @@ class Canvas:
         )
 
     @_add.register
-    def _(self, node: TrailNode, path: str) -> Any:
+    def _(self, node: LineNode, path: str) -> Any:
         pairs = np.stack((node.places_m[:-1], node.places_m[1:]), axis=1)
         return self._scene.add_line_segments(
             path,
             pairs,
-            TRAIL_COLOUR,
+            node.colour,
             thickness=0.003 * self.size_m,
             thickness_units="world",
         )
