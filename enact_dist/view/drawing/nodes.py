@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from enact_dist.recording.drawing.solids import Capsule
+    from enact_dist.view.drawing.robots import LinkShape
 
     Colour = tuple[int, int, int]
 
@@ -59,6 +60,15 @@ class CapsulesNode(Node):
 
     capsules: tuple[Capsule, ...]
     colour: Colour
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RobotNode(Node):
+    """The shapes of a robot and where each is, (S, 4, 4); in their own colours or in one."""
+
+    shapes: tuple[LinkShape, ...]
+    poses: NDArray[np.float64]
+    colour: Colour | None
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
+from enact_dist.errors import ConfigError
 from enact_dist.recording.drawing.drawables import (
     ShownCamera,
     ShownCapsules,
@@ -33,9 +34,11 @@ from enact_dist.view.drawing.nodes import (
     LineNode,
     Node,
     PointsNode,
+    RobotNode,
     SurfaceNode,
 )
 from enact_dist.view.drawing.pixels import rgb_of, with_mask
+from enact_dist.view.drawing.robots import Robot, robot_of
 from enact_dist.wire.payload import decode_untyped
 
 if TYPE_CHECKING:
@@ -142,9 +145,11 @@ def scene_of(
         for kind, drawable in shown.drawables.items():
             made = _made(shown, kind, drawable, tint)
             if isinstance(drawable, ShownJoints):
-                made = _arm(
-                    shown, drawable, data.get(slot._replace(aspect=shown.shows.model)), tint
-                )
+                model = data.get(slot._replace(aspect=shown.shows.model))
+                try:
+                    made = _arm(shown, drawable, model, tint)
+                except ConfigError as error:
+                    remarks.append(f"{slot} v{shown.recorded.version}: {error}")
             if made is not None:
                 nodes[f"{slot}#{kind}"] = made
             remarks += _thinned(slot, drawable, made)
@@ -224,17 +229,27 @@ def _node(frame: str, drawable: Drawable | None, tint: Colour | None) -> Node | 
 def _arm(
     shown: ShownDatum, joints: ShownJoints, model: ShownDatum | None, tint: Colour | None
 ) -> Node | None:
-    """Return an arm at the positions of its joints; None without a model that fits."""
-    if model is None:
+    """Return an arm at the positions of its joints; None without a model that fits.
+
+    Raises:
+        ConfigError: Its file cannot be drawn, or has other joints.
+    """
+    file = shown.shows.urdf
+    described = robot_of(file) if file is not None else model
+    if described is None:
         return None
-    key = ("arm", tint, id(model))
+    key = ("arm", tint, id(described))
     known = shown.made.get(key)
     if known is None:
         _forget_older(shown.made, "arm")
-        capsules = arm_capsules(model.value, joints.positions)
         frame = shown.shows.frame_of(shown.recorded.slot.entity)
-        node = CapsulesNode(frame, capsules, tint or ARM_COLOUR) if capsules else None
-        known = shown.made[key] = node, model  # referenced, so that its id stays its own
+        node: Node | None = None
+        if isinstance(described, Robot):
+            poses = described.poses(joints, named=bool(shown.shows.joints))
+            node = RobotNode(frame, described.shapes, poses, tint) if len(poses) else None
+        elif capsules := arm_capsules(described.value, joints.positions):
+            node = CapsulesNode(frame, capsules, tint or ARM_COLOUR)
+        known = shown.made[key] = node, described  # referenced, so that its id stays its own
     arm: Node | None = known[0]
     return arm
 
@@ -375,6 +390,12 @@ def _places(node: Node) -> NDArray[np.float64]:
         found = np.asarray(node.points_m, np.float64)
     elif isinstance(node, SurfaceNode):
         found = np.asarray(node.vertices_m, np.float64)
+    elif isinstance(node, RobotNode):
+        moved = [
+            shape.corners_m @ pose[:3, :3].T + pose[:3, 3]
+            for shape, pose in zip(node.shapes, node.poses, strict=True)
+        ]
+        found = np.concatenate(moved)
     elif isinstance(node, LineNode):
         found = np.asarray(node.places_m, np.float64)
     elif isinstance(node, CubesNode):

@@ -19,6 +19,7 @@ from enact_dist.view.drawing.nodes import (
     LineNode,
     Node,
     PointsNode,
+    RobotNode,
     SurfaceNode,
 )
 from enact_dist.view.drawing.shapes import (
@@ -171,6 +172,14 @@ class Canvas:
         ):
             handle.move(node)
             return True
+        if (
+            isinstance(node, RobotNode)
+            and isinstance(before, RobotNode)
+            and before.shapes is node.shapes
+            and before.colour == node.colour
+        ):
+            handle.move(node)
+            return True
         return False
 
     @singledispatchmethod
@@ -238,6 +247,22 @@ class Canvas:
         )
 
     @_add.register
+    def _(self, node: RobotNode, path: str) -> Any:
+        parts = [
+            self._scene.add_mesh_simple(
+                f"{path}s{number}",
+                shape.vertices_m,
+                shape.triangles,
+                color=node.colour or shape.colour,
+                flat_shading=True,
+            )
+            for number, shape in enumerate(node.shapes)
+        ]
+        robot = _Robot(parts)
+        robot.move(node)
+        return robot
+
+    @_add.register
     def _(self, node: AxesNode, path: str) -> Any:
         turned, place = _pose(node.matrix)
         length_m = 0.05 * self.size_m
@@ -291,6 +316,21 @@ class _Capsules:
     def remove(self) -> None:
         self._ends.remove()
         self._bodies.remove()
+
+
+class _Robot:
+    """The shapes of a robot: they move without being sent again."""
+
+    def __init__(self, parts: list[Any]) -> None:
+        self._parts = parts
+
+    def move(self, node: RobotNode) -> None:
+        for part, pose in zip(self._parts, node.poses, strict=True):
+            part.wxyz, part.position = _pose(pose)
+
+    def remove(self) -> None:
+        for part in self._parts:
+            part.remove()
 
 
 def _pose(
