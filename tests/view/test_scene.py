@@ -108,6 +108,17 @@ def test_a_cloud_keeps_its_colours_and_loses_what_is_not_finite():
     assert node.colours.tolist() == [[1, 2, 3], [7, 8, 9]]
 
 
+def test_a_cloud_without_colours_is_lighter_where_it_is_higher():
+    points = np.zeros((101, 3))
+    points[:, 2] = np.arange(101.0)
+    points[7, 2] = 1e30
+    colours = one_node(shown(Cloud(points), "point_cloud")).colours
+    assert (colours[0].tolist(), colours[100].tolist()) == ([20, 40, 90], [150, 195, 240])
+    assert np.allclose(colours[50], [85, 117, 165], atol=3)
+    flat = one_node(shown(Cloud(np.ones((3, 3))), "point_cloud")).colours
+    assert flat.tolist() == [[20, 40, 90]] * 3
+
+
 def test_an_empty_cloud_is_no_node():
     """A browser stops at a cloud without points."""
     empty = shown(Cloud(np.empty((0, 3))))

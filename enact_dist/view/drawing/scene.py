@@ -69,7 +69,8 @@ IN_SCENE: Final = frozenset(
      "trajectory", "transform", "calibration", "joints")
 )  # fmt: skip
 """Kinds of `enact_dist.config.shows` that the scene shows; the others are values in the tree."""
-CLOUD_COLOUR: Final = (60, 90, 140)
+CLOUD_COLOURS: Final = np.array(((20, 40, 90), (150, 195, 240)), np.float64)
+"""Of the lowest and of the highest points of a cloud without colours: one alone shows no shape."""
 MESH_COLOUR: Final = (170, 172, 180)
 VOXEL_COLOUR: Final = (242, 140, 38)
 CAPSULE_COLOUR: Final = (64, 128, 217)
@@ -265,10 +266,21 @@ def _points(frame: str, cloud: ShownCloud, tint: Colour | None) -> PointsNode | 
     there = np.isfinite(points).all(axis=1)
     if not there.any():
         return None
-    if tint is not None or cloud.colours is None:
-        return PointsNode(frame, points[there], tint or CLOUD_COLOUR, 0.0, step)
+    points = points[there]
+    if tint is not None:
+        return PointsNode(frame, points, tint, 0.0, step)
+    if cloud.colours is None:
+        return PointsNode(frame, points, _by_height(points[:, 2]), 0.0, step)
     colours = np.ascontiguousarray(cloud.colours[::step][there])
-    return PointsNode(frame, points[there], colours, 0.0, step)
+    return PointsNode(frame, points, colours, 0.0, step)
+
+
+def _by_height(heights_m: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return colours (N, 3) of points by their heights (N,); a few outliers do not count."""
+    low, high = np.quantile(heights_m.astype(np.float64), (0.02, 0.98))
+    shares = np.clip((heights_m - low) / max(high - low, 1e-9), 0.0, 1.0)[:, None]
+    dark, light = CLOUD_COLOURS
+    return np.asarray(np.rint(dark + shares * (light - dark)), np.uint8)
 
 
 def _thinned(slot: Slot, drawable: Drawable | None, node: Node | None) -> Iterator[str]:
