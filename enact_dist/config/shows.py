@@ -27,8 +27,13 @@ kind             takes the first part of the datum, in the order of its fields, 
                  the arm if ``model`` names an aspect of the same entity whose datum has ``dh``
                  (J, 4): d (m), a (m), alpha (rad), offset of theta (rad), classic; ``base`` (4, 4):
                  the first frame in ``frame``; ``capsules`` (n, 5): frame (0 is the base), offset
-                 along its z (m), frame, offset (m), radius (m)
+                 along its z (m), frame, offset (m), radius (m).  Or ``urdf = "…"`` names a file,
+                 relative to ``cell.toml``: the visual shapes of its links, their base in ``frame``,
+                 moved by its joints in the order of the file, or as ``joints`` names them
 ``pose``         a rigid (4, 4), metres: where the thing is in ``frame``
+``trajectory``   a path: an array (N, 3) of floats, metres; (N, 7), a place and a unit quaternion in
+                 each row; or rigid (N, 4, 4): the line through the places in ``frame``, which is
+                 drawn again as a whole with each version
 ``transform``    a rigid (4, 4), metres: where ``frame`` is in ``parent``; with ``inverse = true``
                  in the aspect's table: where ``parent`` is in ``frame``
 ``calibration``  a pinhole camera: ``width_px height_px fx_px fy_px cx_px cy_px``, or
@@ -52,6 +57,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Final
 
 from enact_dist.config.table import TableKey
@@ -68,6 +74,7 @@ KINDS: Final = (
     "capsules",
     "joints",
     "pose",
+    "trajectory",
     "transform",
     "calibration",
     "json",
@@ -96,6 +103,7 @@ class Shows:
         origin_m: Lowest corner of the grid of voxels if the datum has none.
         joints: Names of joints, in order.
         model: Aspect of the same entity that is the model of an arm; see above.
+        urdf: File with the links and joints of a robot; see above.
         inverse: A transform gives the parent in the frame, not the frame in the parent.
 
     Raises:
@@ -111,6 +119,7 @@ class Shows:
     origin_m: tuple[float, ...] = (0.0, 0.0, 0.0)
     joints: tuple[str, ...] = ()
     model: str = ""
+    urdf: Path | None = None
     inverse: bool = False
 
     def __post_init__(self) -> None:
@@ -126,6 +135,10 @@ class Shows:
             )
         if "transform" in self.kinds and not self.parent:
             raise ConfigError("a transform needs the frame in which it lies: parent = '…'")
+        if self.urdf is not None and (self.model or "joints" not in self.kinds):
+            raise ConfigError(
+                'urdf draws a robot by its joints: it needs shows = "joints", and no model'
+            )
         for frames in (self.frame, self.parent):
             _check_frames(frames)
 

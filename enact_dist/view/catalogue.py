@@ -69,6 +69,7 @@ class SlotCatalogue:
         self._first: dict[str, Slot] = {}
         self._worlds: tuple[str, ...] = ()
         self._rates = Rates()
+        self._changes: Counter[str] = Counter()
         self.newest_ns = 0
 
     def clear(self) -> None:
@@ -104,12 +105,18 @@ class SlotCatalogue:
                 self._first.setdefault(slot.aspect, slot)
             elif self._first.get(slot.aspect) == slot:
                 del self._first[slot.aspect]
+            if before != state:
+                self._changes[slot.context] += 1
             self._states[slot] = state
             self.newest_ns = max(self.newest_ns, state.stamp_ns)
 
     def state(self, slot: Slot) -> ListedState | None:
         """Return the state of a slot, None if it is not known."""
         return self._states.get(slot)
+
+    def changes(self, world: str) -> int:
+        """Return how many changes of the data of a world context were noted so far."""
+        return self._changes[world]
 
     def rate_hz(self, slot: Slot, now_s: float) -> float | None:
         """Return the commits per second of a slot over the last seconds; None: fewer than two."""

@@ -235,6 +235,15 @@ def test_capsules_are_cylinders_with_spheres_at_their_ends():
     assert sorted(round(ball.size.x, 3) for ball in entity.spheres) == [0.2, 0.2, 0.4, 0.4]
 
 
+def test_a_trajectory_is_one_line_of_a_scene():
+    path_m = np.stack([np.eye(4), TURNED])
+    (entity,) = shown(path_m, "trajectory", frame="cell")[""].entities
+    (line,) = entity.lines
+    assert (entity.frame_id, line.type) == ("cell", line.LINE_STRIP)
+    assert [(one.x, one.y, one.z) for one in line.points] == [(0, 0, 0), (0.1, 0.2, 0.3)]
+    assert shown(np.zeros((3, 4)), "trajectory")["unfit"] == ["trajectory"]
+
+
 @dataclass(frozen=True, eq=False)
 class Arm:
     q: np.ndarray
@@ -323,9 +332,9 @@ def test_datum_that_does_not_fit_is_told_and_shown_as_json(kind):
 def test_null_takes_a_mesh_away_and_empties_a_cloud():
     """What was deleted does not stand in the scene for ever."""
     gone = recorded("piece", None, null="DELETED")
-    wanted = Shows(("mesh", "point_cloud", "voxels", "capsules", "joints"))
-    (mesh, cloud, voxels, capsules, joints) = pictures_of(gone, wanted).pictures
-    for scene in (mesh, voxels, capsules):
+    wanted = Shows(("mesh", "point_cloud", "voxels", "capsules", "joints", "trajectory"))
+    (mesh, cloud, voxels, capsules, joints, path) = pictures_of(gone, wanted).pictures
+    for scene in (mesh, voxels, capsules, path):
         assert [one.id for one in scene.message.deletions] == ["online:piece/value"]
     assert not joints.message.joints
     assert cloud.message.data == b""

@@ -10,7 +10,7 @@ from enact_dist import Entity, Lock, Write
 from enact_dist.access.snapshot import HeldView
 from enact_dist.config.shows import GUESSED
 from enact_dist.core.protocol.datum import Slot
-from enact_dist.errors import UnknownWorldError
+from enact_dist.errors import MisuseError, UnknownWorldError
 from enact_dist.recording import Recorder
 from enact_dist.recording.reading import Recording
 from enact_dist.view import feed as feeds
@@ -226,19 +226,91 @@ def test_a_difference_is_coloured_and_labelled(cell, feed):
     assert contents.comparing.right_tints() == {}
 
 
-def test_now_is_a_difference_that_is_made_again(cell, feed, monkeypatch):
-    """Once the present is a later one, and not before its time."""
-    comparing = contents_of(cell, feed).comparing
-    comparing.against, before = NOW, move(cell, 1.0)
-    left = Side("online", before.stamp_ns)
-    comparing.look(left, live=False, now_ns=before.stamp_ns, marked_ns=0)
-    assert "0 differ" in comparing.content
-    after = move(cell, 2.0)
-    comparing.look(left, live=False, now_ns=after.stamp_ns, marked_ns=0)
-    assert "0 differ" in comparing.content
+class Differences:
+    """What a page compares, and how often it did."""
+
+    def __init__(self, cell, feed):
+        self.made, self.catalogue = 0, feed.catalogue
+        self.error = None
+        viewer = Shim(cell)
+
+        def compare(*sides):
+            self.made += 1
+            if self.error:
+                raise self.error
+            return Viewer.compare(viewer, *sides)
+
+        self.shown = PageContents(feed, CellSource(cell), compare).comparing
+
+    def look(self, left, *, live):
+        now_ns = self.catalogue.newest_ns
+        self.shown.look(left, live=live, now_ns=now_ns, marked_ns=left.at_ns)
+        return self.made
+
+    def until(self, made, left, *, live):
+        until(lambda: self.look(left, live=live) == made)
+
+
+@pytest.mark.parametrize(("against", "differ"), [(NOW, 0), ("truth", 1), (MARKED, 0)])
+def test_a_difference_with_the_present_is_made_when_its_data_change(
+    cell, feed, monkeypatch, against, differ
+):
+    """At once, and neither by a clock nor because another world context has changed."""
+    cell.world("online").fork("elsewhere")
+    feed.wish("page", [])
+    before = move(cell, 1.0)
+    move(cell, 1.0, "truth")
+    until(lambda: all(map(feed.catalogue.state, (SPEED_SLOT, Slot("truth", "arm", "pose")))))
+    until(lambda: feed.catalogue.newest_ns >= before.stamp_ns)
+    found, left = Differences(cell, feed), Side("online", before.stamp_ns)
+    found.shown.against = against
+    monkeypatch.setattr("enact_dist.view.pages.comparing.PAUSE", 0.0)
     monkeypatch.setattr("enact_dist.view.pages.comparing.AGAIN_S", 0.0)
-    comparing.look(left, live=False, now_ns=after.stamp_ns, marked_ns=0)
-    assert "1 differ" in comparing.content
+    live = against != NOW
+    for _ in range(3):
+        assert found.look(left, live=live) == 1
+    assert f"{differ} differ" in found.shown.content
+
+    other = move(cell, 5.0, "elsewhere")
+    until(lambda: feed.catalogue.newest_ns >= other.stamp_ns)
+    assert found.look(left, live=live) == 1
+
+    move(cell, 2.0)
+    found.until(2, left, live=live)
+    assert f"{differ + 1} differ" in found.shown.content
+
+
+def test_a_slow_difference_takes_a_tenth_of_the_time_and_a_choice_is_shown_at_once(
+    cell, feed, monkeypatch
+):
+    feed.wish("page", [])
+    before = move(cell, 1.0)
+    until(lambda: feed.catalogue.state(SLOT))
+    found, left = Differences(cell, feed), Side("online", before.stamp_ns)
+    found.shown.against = NOW
+    monkeypatch.setattr("enact_dist.view.pages.comparing.PAUSE", 1e9)
+    assert found.look(left, live=False) == 1
+    after = move(cell, 2.0)
+    until(lambda: feed.catalogue.newest_ns >= after.stamp_ns)
+    assert found.look(left, live=False) == 1
+    assert found.look(Side("online", after.stamp_ns), live=False) == 2
+    found.shown.against = "truth"
+    assert found.look(Side("online", after.stamp_ns), live=False) == 3
+
+
+def test_a_difference_that_failed_is_tried_again_after_a_pause(cell, feed, monkeypatch):
+    feed.wish("page", [])
+    before = move(cell, 1.0)
+    until(lambda: feed.catalogue.state(SLOT))
+    found, left = Differences(cell, feed), Side("online", before.stamp_ns)
+    found.shown.against, found.error = NOW, MisuseError("a shard is away")
+    assert found.look(left, live=False) == 1
+    assert "a shard is away" in found.shown.content
+    found.error = None
+    assert found.look(left, live=False) == 1
+    monkeypatch.setattr(found.shown, "_due_s", 0.0)
+    assert found.look(left, live=False) == 2
+    assert "0 differ" in found.shown.content
 
 
 def test_causes_are_steps_and_a_label_keeps_them(cell, feed):

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as nps
-from view_samples import shown
+from view_samples import shown, slot
 
 from enact_dist.errors import ConfigError
 from enact_dist.recording.drawing.solids import outer_voxels, voxel_faces
@@ -22,6 +22,7 @@ from enact_dist.view.drawing.nodes import (
     CapsulesNode,
     CubesNode,
     FrustumNode,
+    LineNode,
     PointsNode,
     SurfaceNode,
 )
@@ -107,6 +108,17 @@ def test_a_cloud_keeps_its_colours_and_loses_what_is_not_finite():
     assert node.colours.tolist() == [[1, 2, 3], [7, 8, 9]]
 
 
+def test_a_cloud_without_colours_is_lighter_where_it_is_higher():
+    points = np.zeros((101, 3))
+    points[:, 2] = np.arange(101.0)
+    points[7, 2] = 1e30
+    colours = one_node(shown(Cloud(points), "point_cloud")).colours
+    assert (colours[0].tolist(), colours[100].tolist()) == ([20, 40, 90], [150, 195, 240])
+    assert np.allclose(colours[50], [85, 117, 165], atol=3)
+    flat = one_node(shown(Cloud(np.ones((3, 3))), "point_cloud")).colours
+    assert flat.tolist() == [[20, 40, 90]] * 3
+
+
 def test_an_empty_cloud_is_no_node():
     """A browser stops at a cloud without points."""
     empty = shown(Cloud(np.empty((0, 3))))
@@ -187,9 +199,76 @@ def test_an_arm_stands_as_its_joints_say():
     assert scene_of({joints.recorded.slot: joints}).nodes == {}
 
 
-def test_a_datum_that_does_not_fit_its_kind_is_left_out():
-    wrong = shown(np.zeros(4), "capsules", "pose")
-    assert scene_of({wrong.recorded.slot: wrong}).nodes == {}
+def test_a_datum_that_does_not_fit_its_kind_is_left_out_and_named():
+    wrong = shown(np.zeros(4), "capsules", "trajectory")
+    assert scene_of({wrong.recorded.slot: wrong})[::2] == (
+        {},
+        tuple(
+            f"online:thing/x v1 does not fit the kind {kind}" for kind in ("capsules", "trajectory")
+        ),
+    )
+
+
+# ---------------------------------------------------------------- paths
+
+PLACES_M = np.array([[0.0, 0, 1], [1, 0, 1], [1, 2, 1]])
+TURNS = np.array([[1.0, 0, 0, 0], [0, 0.6, 0.8, 0], [0.5, 0.5, 0.5, 0.5]])
+
+
+@dataclass(frozen=True, eq=False)
+class Planned:
+    name: str
+    tool: np.ndarray
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        PLACES_M,
+        PLACES_M.astype(np.float32),
+        np.hstack((PLACES_M, TURNS)),
+        np.stack([moved(*place) for place in PLACES_M]),
+        Planned("to the goal", PLACES_M),
+        np.vstack((PLACES_M[:2], np.full((1, 3), np.nan), PLACES_M[2:])),
+    ],
+)
+def test_a_trajectory_is_a_line_through_its_places(path):
+    node = one_node(shown(path, "trajectory", frame="cell"))
+    assert isinstance(node, LineNode)
+    assert (node.frame, node.places_m.tolist()) == ("cell", PLACES_M.tolist())
+    assert Trails().follow({"path": node}, 1) == {}
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        np.zeros((3, 2)),
+        np.zeros((3, 3), np.int64),
+        np.hstack((PLACES_M, 2.0 * TURNS)),  # seven joints, or capsules
+        np.stack([np.eye(4), 2.0 * np.eye(4)]),
+        np.zeros((0, 5, 5)),
+    ],
+)
+def test_what_is_no_path_does_not_fit_a_trajectory(path):
+    assert shown(path, "trajectory").drawables == {"trajectory": None}
+
+
+def test_a_path_of_less_than_two_places_or_too_far_away_is_no_line():
+    for path in (np.zeros((0, 3)), np.zeros((1, 3)), np.full((2, 3), 1e300)):
+        found = scene_of({slot("thing"): shown(path, "trajectory")})
+        assert (found.nodes, found.remarks) == ({}, ())
+
+
+def test_a_long_path_is_thinned_and_keeps_its_ends():
+    path = np.arange(3.0 * 25_000).reshape(-1, 3)
+    scene = scene_of({slot("thing"): shown(path, "trajectory")})
+    (node,) = scene.nodes.values()
+    assert len(node.places_m) == 8_334
+    assert node.places_m[[0, -1]].tolist() == path[[0, -1]].tolist()
+    assert scene.remarks == (
+        "online:thing/x has 25000 places; a line through 8334 of them is shown",
+    )
+    assert extent_of(scene)[1].tolist() == path[-1].tolist()
 
 
 def test_a_colour_of_a_difference_replaces_that_of_the_datum():

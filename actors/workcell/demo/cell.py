@@ -83,6 +83,7 @@ def configured(template: str, options: Options) -> dict[str, Any]:
         "voxel_m": options.voxel_m,
         "scale": options.scale,
     }
+    config["aspects"]["hull"]["voxel_m"] = options.voxel_m
     for table in actors.values():
         if table["class"] == CAMERA:
             table["args"] = {**table.get("args", {}), "source": options.source}

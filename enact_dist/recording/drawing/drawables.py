@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from enact_dist.recording.drawing.geometry import is_rigid
+from enact_dist.recording.drawing.geometry import is_rigid, path_of
 from enact_dist.recording.drawing.parts import (
     array_beside,
     arrays_of,
@@ -113,6 +113,12 @@ class ShownPose(NamedTuple):
     matrix: NDArray[Any]
 
 
+class ShownTrajectory(NamedTuple):
+    """A path through its frame: (N, 3) floats, metres, those places alone that are finite."""
+
+    places_m: NDArray[np.float64]
+
+
 class ShownTransform(NamedTuple):
     """Where a frame is in its parent: (4, 4) rigid, metres."""
 
@@ -149,6 +155,7 @@ Drawable = (
     | ShownCapsules
     | ShownJoints
     | ShownPose
+    | ShownTrajectory
     | ShownTransform
     | ShownCamera
     | ShownPlain
@@ -258,6 +265,14 @@ def _pose(part: object, _: Shows) -> ShownPose | None:
     return ShownPose(matrix) if matrix is not None else None
 
 
+def _trajectory(part: object, _: Shows) -> ShownTrajectory | None:
+    for array, _beside in _named_first(part, "points_m"):
+        places_m = path_of(array)
+        if places_m is not None:
+            return ShownTrajectory(places_m[np.isfinite(places_m).all(axis=1)])
+    return None
+
+
 def _transform(part: object, shows: Shows) -> ShownTransform | None:
     matrix = _rigid(part)
     if matrix is None:
@@ -300,6 +315,7 @@ _KINDS: Final[dict[str, Callable[[object, Shows], Drawable | None]]] = {
     "capsules": _capsules,
     "joints": _joints,
     "pose": _pose,
+    "trajectory": _trajectory,
     "transform": _transform,
     "calibration": _calibration,
     "json": _plain,

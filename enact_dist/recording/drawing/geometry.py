@@ -31,6 +31,29 @@ def is_rigid(matrix: NDArray[Any]) -> bool:
     )
 
 
+def path_of(array: NDArray[Any]) -> NDArray[np.float64] | None:
+    """Return the places (N, 3) along a path, metres; None if the array is none.
+
+    Args:
+        array: Floats: (N, 3) places, (N, 7) places each with a unit quaternion behind it, or
+            (N, 4, 4) rigid transforms.
+    """
+    if array.dtype.kind != "f":
+        return None
+    if array.ndim == 2 and array.shape[1] == 3:
+        return np.asarray(array, np.float64)
+    if array.ndim == 2 and array.shape[1] == 7:
+        # Rows of seven are capsules and the joints of an arm, too: these have no unit quaternions.
+        rows = np.asarray(array, np.float64)
+        turns = rows[np.isfinite(rows).all(axis=1), 3:]
+        with np.errstate(over="ignore"):
+            is_path = np.allclose(np.linalg.norm(turns, axis=1), 1.0, atol=RIGID_TOLERANCE)
+        return rows[:, :3] if is_path else None
+    if array.ndim == 3 and all(map(is_rigid, array)):
+        return np.asarray(array[:, :3, 3], np.float64) if array.shape[1:] == (4, 4) else None
+    return None
+
+
 def quaternion(rotation: NDArray[Any]) -> tuple[float, float, float, float]:
     """Return (x, y, z, w), unit length, w not negative, of a rotation matrix (3, 3).
 

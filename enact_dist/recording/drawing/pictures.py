@@ -15,6 +15,7 @@ import numpy as np
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
+from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
 from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
@@ -32,6 +33,7 @@ from enact_dist.recording.drawing.drawables import (
     ShownMesh,
     ShownPlain,
     ShownPose,
+    ShownTrajectory,
     ShownTransform,
     ShownVoxels,
     drawables_of,
@@ -63,7 +65,9 @@ ITEMS_MAX: Final = 1024
 SURFACE_COLOUR: Final = (0.75, 0.75, 0.78, 1.0)
 VOXEL_COLOUR: Final = (0.95, 0.55, 0.15, 0.9)
 CAPSULE_COLOUR: Final = (0.25, 0.5, 0.85, 0.8)
-_SCENES: Final = ("mesh", "voxels", "capsules")
+PATH_COLOUR: Final = (0.85, 0.15, 0.5, 1.0)
+PATH_WIDTH_PX: Final = 3.0
+_SCENES: Final = ("mesh", "voxels", "capsules", "trajectory")
 """Kinds that are entities of a scene: they stay until another one replaces them."""
 
 
@@ -256,6 +260,19 @@ def _pose(recorded: Recorded, shows: Shows, shown: ShownPose) -> Message:
     return found
 
 
+def _trajectory(recorded: Recorded, shows: Shows, shown: ShownTrajectory) -> Message:
+    update, entity = _scene(recorded, shows)
+    line = LinePrimitive()
+    number = LinePrimitive.DESCRIPTOR.fields_by_name["points"].number
+    line.ParseFromString(encoded_points(shown.places_m, number))
+    line.type = LinePrimitive.LINE_STRIP
+    line.pose.orientation.w = 1.0
+    line.thickness, line.scale_invariant = PATH_WIDTH_PX, True
+    _paint(line.color, PATH_COLOUR)
+    entity.lines.append(line)
+    return update
+
+
 def _transform(recorded: Recorded, shows: Shows, shown: ShownTransform) -> Message | None:
     parent = shows.parent_of(recorded.slot.entity)
     if not parent:
@@ -352,6 +369,7 @@ _MESSAGES: Final = {
     ShownCapsules: _capsules,
     ShownJoints: _joints,
     ShownPose: _pose,
+    ShownTrajectory: _trajectory,
     ShownTransform: _transform,
     ShownCamera: _calibration,
     ShownPlain: _as_json,

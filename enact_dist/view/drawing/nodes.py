@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from enact_dist.recording.drawing.solids import Capsule
+    from enact_dist.view.drawing.robots import LinkShape
 
     Colour = tuple[int, int, int]
 
@@ -62,6 +63,15 @@ class CapsulesNode(Node):
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class RobotNode(Node):
+    """The shapes of a robot and where each is, (S, 4, 4); in their own colours or in one."""
+
+    shapes: tuple[LinkShape, ...]
+    poses: NDArray[np.float64]
+    colour: Colour | None
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class AxesNode(Node):
     """Axes at a rigid (4, 4)."""
 
@@ -70,10 +80,11 @@ class AxesNode(Node):
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class TrailNode(Node):
+class LineNode(Node):
     """A line through places (N, 3), N > 1."""
 
     places_m: NDArray[np.float32]
+    colour: Colour
 
 
 @dataclass(frozen=True, eq=False, slots=True)

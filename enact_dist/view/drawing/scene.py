@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
+from enact_dist.errors import ConfigError
 from enact_dist.recording.drawing.drawables import (
     ShownCamera,
     ShownCapsules,
@@ -16,6 +17,7 @@ from enact_dist.recording.drawing.drawables import (
     ShownJoints,
     ShownMesh,
     ShownPose,
+    ShownTrajectory,
     ShownTransform,
     ShownVoxels,
     drawables_of,
@@ -29,11 +31,14 @@ from enact_dist.view.drawing.nodes import (
     CubesNode,
     FrustumNode,
     LabelNode,
+    LineNode,
     Node,
     PointsNode,
+    RobotNode,
     SurfaceNode,
 )
 from enact_dist.view.drawing.pixels import rgb_of, with_mask
+from enact_dist.view.drawing.robots import Robot, robot_of
 from enact_dist.wire.payload import decode_untyped
 
 if TYPE_CHECKING:
@@ -51,6 +56,8 @@ if TYPE_CHECKING:
 POINTS_MAX: Final = 100_000
 """Points of a larger cloud are thinned; the page says so."""
 TRIANGLES_MAX: Final = 300_000
+PLACES_MAX: Final = 10_000
+"""Places of a longer path are thinned."""
 CUBES_MAX: Final = 1_000
 """More voxels than this are drawn as square points."""
 VARIANTS_MAX: Final = 4
@@ -58,15 +65,17 @@ VARIANTS_MAX: Final = 4
 FIELD_RAD: Final = math.radians(50.0)
 """Vertical field of an image whose camera is not known."""
 IN_SCENE: Final = frozenset(
-    ("image", "mask", "point_cloud", "mesh", "voxels", "capsules", "pose", "transform",
-     "calibration", "joints")
+    ("image", "mask", "point_cloud", "mesh", "voxels", "capsules", "pose",
+     "trajectory", "transform", "calibration", "joints")
 )  # fmt: skip
 """Kinds of `enact_dist.config.shows` that the scene shows; the others are values in the tree."""
-CLOUD_COLOUR: Final = (60, 90, 140)
+CLOUD_COLOURS: Final = np.array(((20, 40, 90), (150, 195, 240)), np.float64)
+"""Of the lowest and of the highest points of a cloud without colours: one alone shows no shape."""
 MESH_COLOUR: Final = (170, 172, 180)
 VOXEL_COLOUR: Final = (242, 140, 38)
 CAPSULE_COLOUR: Final = (64, 128, 217)
 ARM_COLOUR: Final = (225, 120, 20)
+PATH_COLOUR: Final = (215, 40, 130)
 FRUSTUM_COLOUR: Final = (40, 40, 40)
 
 
@@ -137,12 +146,16 @@ def scene_of(
         for kind, drawable in shown.drawables.items():
             made = _made(shown, kind, drawable, tint)
             if isinstance(drawable, ShownJoints):
-                made = _arm(
-                    shown, drawable, data.get(slot._replace(aspect=shown.shows.model)), tint
-                )
+                model = data.get(slot._replace(aspect=shown.shows.model))
+                try:
+                    made = _arm(shown, drawable, model, tint)
+                except ConfigError as error:
+                    remarks.append(f"{slot} v{shown.recorded.version}: {error}")
             if made is not None:
                 nodes[f"{slot}#{kind}"] = made
             remarks += _thinned(slot, drawable, made)
+            if drawable is None:
+                remarks.append(f"{slot} v{shown.recorded.version} does not fit the kind {kind}")
     for camera in _cameras(data, tints).values():
         nodes[f"{camera.parts[0].recorded.slot}#camera"] = _frustum(camera)
         remarks += camera.remarks
@@ -205,23 +218,39 @@ def _node(frame: str, drawable: Drawable | None, tint: Colour | None) -> Node | 
         return CapsulesNode(frame, drawable.capsules, tint or CAPSULE_COLOUR)
     if isinstance(drawable, ShownPose):
         return AxesNode(frame, drawable.matrix, tint)
+    if isinstance(drawable, ShownTrajectory) and len(drawable.places_m) > 1:
+        places_m = drawable.places_m
+        step = -(-len(places_m) // PLACES_MAX)
+        with np.errstate(over="ignore"):
+            kept = np.concatenate((places_m[:-1:step], places_m[-1:])).astype(np.float32)
+        return LineNode(frame, kept, tint or PATH_COLOUR) if np.isfinite(kept).all() else None
     return None
 
 
 def _arm(
     shown: ShownDatum, joints: ShownJoints, model: ShownDatum | None, tint: Colour | None
 ) -> Node | None:
-    """Return an arm at the positions of its joints; None without a model that fits."""
-    if model is None:
+    """Return an arm at the positions of its joints; None without a model that fits.
+
+    Raises:
+        ConfigError: Its file cannot be drawn, or has other joints.
+    """
+    file = shown.shows.urdf
+    described = robot_of(file) if file is not None else model
+    if described is None:
         return None
-    key = ("arm", tint, id(model))
+    key = ("arm", tint, id(described))
     known = shown.made.get(key)
     if known is None:
         _forget_older(shown.made, "arm")
-        capsules = arm_capsules(model.value, joints.positions)
         frame = shown.shows.frame_of(shown.recorded.slot.entity)
-        node = CapsulesNode(frame, capsules, tint or ARM_COLOUR) if capsules else None
-        known = shown.made[key] = node, model  # referenced, so that its id stays its own
+        node: Node | None = None
+        if isinstance(described, Robot):
+            poses = described.poses(joints, named=bool(shown.shows.joints))
+            node = RobotNode(frame, described.shapes, poses, tint) if len(poses) else None
+        elif capsules := arm_capsules(described.value, joints.positions):
+            node = CapsulesNode(frame, capsules, tint or ARM_COLOUR)
+        known = shown.made[key] = node, described  # referenced, so that its id stays its own
     arm: Node | None = known[0]
     return arm
 
@@ -237,10 +266,21 @@ def _points(frame: str, cloud: ShownCloud, tint: Colour | None) -> PointsNode | 
     there = np.isfinite(points).all(axis=1)
     if not there.any():
         return None
-    if tint is not None or cloud.colours is None:
-        return PointsNode(frame, points[there], tint or CLOUD_COLOUR, 0.0, step)
+    points = points[there]
+    if tint is not None:
+        return PointsNode(frame, points, tint, 0.0, step)
+    if cloud.colours is None:
+        return PointsNode(frame, points, _by_height(points[:, 2]), 0.0, step)
     colours = np.ascontiguousarray(cloud.colours[::step][there])
-    return PointsNode(frame, points[there], colours, 0.0, step)
+    return PointsNode(frame, points, colours, 0.0, step)
+
+
+def _by_height(heights_m: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return colours (N, 3) of points by their heights (N,); a few outliers do not count."""
+    low, high = np.quantile(heights_m.astype(np.float64), (0.02, 0.98))
+    shares = np.clip((heights_m - low) / max(high - low, 1e-9), 0.0, 1.0)[:, None]
+    dark, light = CLOUD_COLOURS
+    return np.asarray(np.rint(dark + shares * (light - dark)), np.uint8)
 
 
 def _thinned(slot: Slot, drawable: Drawable | None, node: Node | None) -> Iterator[str]:
@@ -248,6 +288,10 @@ def _thinned(slot: Slot, drawable: Drawable | None, node: Node | None) -> Iterat
         yield f"{slot} has more than {POINTS_MAX} points; one in {node.one_in} is shown"
     if isinstance(drawable, ShownMesh) and len(drawable.triangles) > TRIANGLES_MAX:
         yield f"{slot} has {len(drawable.triangles)} triangles; {TRIANGLES_MAX} are shown"
+    if isinstance(drawable, ShownTrajectory) and isinstance(node, LineNode):
+        count, kept = len(drawable.places_m), len(node.places_m)
+        if kept < count:
+            yield f"{slot} has {count} places; a line through {kept} of them is shown"
 
 
 # ---------------------------------------------------------------- cameras
@@ -358,6 +402,14 @@ def _places(node: Node) -> NDArray[np.float64]:
         found = np.asarray(node.points_m, np.float64)
     elif isinstance(node, SurfaceNode):
         found = np.asarray(node.vertices_m, np.float64)
+    elif isinstance(node, RobotNode):
+        moved = [
+            shape.corners_m @ pose[:3, :3].T + pose[:3, 3]
+            for shape, pose in zip(node.shapes, node.poses, strict=True)
+        ]
+        found = np.concatenate(moved)
+    elif isinstance(node, LineNode):
+        found = np.asarray(node.places_m, np.float64)
     elif isinstance(node, CubesNode):
         found = np.asarray(node.centres_m, np.float64)
     elif isinstance(node, AxesNode):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from enact_dist.view.drawing.nodes import AxesNode, TrailNode
+from enact_dist.view.drawing.nodes import AxesNode, LineNode
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 PLACES_MAX: Final = 200
 """Places of one trail."""
+TRAIL_COLOUR: Final = (120, 60, 160)
 
 
 class Trails:
@@ -23,10 +24,10 @@ class Trails:
 
     def __init__(self) -> None:
         self._places: dict[str, deque[tuple[float, float, float]]] = {}
-        self._nodes: dict[str, tuple[Node, TrailNode | None]] = {}
+        self._nodes: dict[str, tuple[Node, LineNode | None]] = {}
         self._at_ns = 0
 
-    def follow(self, nodes: Mapping[str, Node], at_ns: int) -> dict[str, TrailNode]:
+    def follow(self, nodes: Mapping[str, Node], at_ns: int) -> dict[str, LineNode]:
         """Take the nodes of a moment and return the trails up to it.
 
         Args:
@@ -45,9 +46,11 @@ class Trails:
                 self._nodes[name] = (node, self._longer(name, node))
         return {f"trail {name}": trail for name, (_, trail) in self._nodes.items() if trail}
 
-    def _longer(self, name: str, node: AxesNode) -> TrailNode | None:
+    def _longer(self, name: str, node: AxesNode) -> LineNode | None:
         places = self._places.setdefault(name, deque(maxlen=PLACES_MAX))
         x, y, z = map(float, node.matrix[:3, 3])
         if not places or places[-1] != (x, y, z):
             places.append((x, y, z))
-        return TrailNode(node.frame, np.array(places, np.float32)) if len(places) > 1 else None
+        if len(places) < 2:
+            return None
+        return LineNode(node.frame, np.array(places, np.float32), TRAIL_COLOUR)

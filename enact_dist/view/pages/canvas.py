@@ -16,10 +16,11 @@ from enact_dist.view.drawing.nodes import (
     CubesNode,
     FrustumNode,
     LabelNode,
+    LineNode,
     Node,
     PointsNode,
+    RobotNode,
     SurfaceNode,
-    TrailNode,
 )
 from enact_dist.view.drawing.shapes import (
     CUBE,
@@ -43,7 +44,6 @@ if TYPE_CHECKING:
 JPEG_QUALITY: Final = 75
 _FROM: Final = np.array((0.75, -0.75, 0.6))
 """From where a page looks, in sizes of the scene."""
-TRAIL_COLOUR: Final = (120, 60, 160)
 
 
 class Canvas:
@@ -172,6 +172,14 @@ class Canvas:
         ):
             handle.move(node)
             return True
+        if (
+            isinstance(node, RobotNode)
+            and isinstance(before, RobotNode)
+            and before.shapes is node.shapes
+            and before.colour == node.colour
+        ):
+            handle.move(node)
+            return True
         return False
 
     @singledispatchmethod
@@ -239,6 +247,22 @@ class Canvas:
         )
 
     @_add.register
+    def _(self, node: RobotNode, path: str) -> Any:
+        parts = [
+            self._scene.add_mesh_simple(
+                f"{path}s{number}",
+                shape.vertices_m,
+                shape.triangles,
+                color=node.colour or shape.colour,
+                flat_shading=True,
+            )
+            for number, shape in enumerate(node.shapes)
+        ]
+        robot = _Robot(parts)
+        robot.move(node)
+        return robot
+
+    @_add.register
     def _(self, node: AxesNode, path: str) -> Any:
         turned, place = _pose(node.matrix)
         length_m = 0.05 * self.size_m
@@ -253,12 +277,12 @@ class Canvas:
         )
 
     @_add.register
-    def _(self, node: TrailNode, path: str) -> Any:
+    def _(self, node: LineNode, path: str) -> Any:
         pairs = np.stack((node.places_m[:-1], node.places_m[1:]), axis=1)
         return self._scene.add_line_segments(
             path,
             pairs,
-            TRAIL_COLOUR,
+            node.colour,
             thickness=0.003 * self.size_m,
             thickness_units="world",
         )
@@ -292,6 +316,21 @@ class _Capsules:
     def remove(self) -> None:
         self._ends.remove()
         self._bodies.remove()
+
+
+class _Robot:
+    """The shapes of a robot: they move without being sent again."""
+
+    def __init__(self, parts: list[Any]) -> None:
+        self._parts = parts
+
+    def move(self, node: RobotNode) -> None:
+        for part, pose in zip(self._parts, node.poses, strict=True):
+            part.wxyz, part.position = _pose(pose)
+
+    def remove(self) -> None:
+        for part in self._parts:
+            part.remove()
 
 
 def _pose(

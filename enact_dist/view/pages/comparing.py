@@ -22,7 +22,10 @@ if TYPE_CHECKING:
     from enact_dist.compare.diff import Comparison, Diff
 
 AGAIN_S: Final = 1.0
-"""How often a difference with the present is made anew."""
+"""Pause after a difference that could not be made."""
+PAUSE: Final = 9.0
+"""Pause after a difference with the present, in durations of its making: a tenth of the time goes
+into differences, however fast the data change."""
 NOW: Final = "now"
 MARKED: Final = "the marked moment"
 
@@ -34,11 +37,20 @@ class Side(NamedTuple):
     at_ns: int
 
 
+class _SideKey(NamedTuple):
+    """What a side holds: its moment, or how often its world context has changed until now."""
+
+    world: str
+    at_ns: int
+    changes: int
+
+
 class ShownDifference:
-    """Makes the difference and colours it.
+    """Makes the difference when what it compares has changed, and colours it.
 
     Args:
         compare: Returns how two sides differ.
+        changes: Returns how often a world context has changed so far.
 
     Attributes:
         against: `NOW`, `MARKED`, a world context, or "": nothing.
@@ -46,14 +58,17 @@ class ShownDifference:
         content: The difference as HTML, or why there is none.
     """
 
-    def __init__(self, compare: Callable[[Side, Side], Diff]) -> None:
-        self._compare = compare
+    def __init__(
+        self, compare: Callable[[Side, Side], Diff], changes: Callable[[str], int]
+    ) -> None:
+        self._compare, self._changes = compare, changes
         self.against = ""
         self.right = Side("", 0)
         self.content = ""
         self._rows: tuple[Comparison, ...] = ()
-        self._key: tuple[Side, Side] | None = None
-        self._made_s = 0.0
+        self._key: tuple[_SideKey, _SideKey] | None = None
+        self._failed = False
+        self._due_s = 0.0
 
     def look(self, left: Side, *, live: bool, now_ns: int, marked_ns: int) -> None:
         """Make the difference if what it compares has changed.
@@ -67,24 +82,43 @@ class ShownDifference:
         if not self.against:
             self._rows, self._key, self.content = (), None, ""
             return
+        if live:
+            left = Side(left.world, now_ns)
         if self.against == NOW:
             right = Side(left.world, now_ns)
         elif self.against == MARKED:
             right = Side(left.world, marked_ns)
         else:
             right = Side(self.against, left.at_ns)
-        moves = live or self.against == NOW
-        if (left, right) == self._key or not left.at_ns or not right.at_ns:
+        if not left.at_ns or not right.at_ns:
             return
-        if moves and time.monotonic() - self._made_s < AGAIN_S:
-            return
-        self._key, self.right = (left, right), right
+        is_others = self.against not in (NOW, MARKED)
+        key = (
+            self._key_of(left, present=live),
+            self._key_of(right, present=self.against == NOW or (live and is_others)),
+        )
+        begun_s = time.monotonic()
+        if self._key is not None:
+            if key == self._key and not self._failed:
+                return
+            same_moments = [each[:2] for each in key] == [each[:2] for each in self._key]
+            if same_moments and begun_s < self._due_s:
+                return
+        self._key, self._failed, self.right = key, False, right
         try:
             diff = self._compare(left, right)
             self._rows, self.content = diff.rows, difference_table(diff)
         except EnactError as error:
             self._rows, self.content = (), small(text(error))
-        self._made_s = time.monotonic()
+            self._failed = True
+        ended_s = time.monotonic()
+        pause_s = PAUSE * (ended_s - begun_s)
+        self._due_s = ended_s + (max(AGAIN_S, pause_s) if self._failed else pause_s)
+
+    def _key_of(self, side: Side, *, present: bool) -> _SideKey:
+        if present:
+            return _SideKey(side.world, 0, self._changes(side.world))
+        return _SideKey(side.world, side.at_ns, 0)
 
     def tint(self, slot: Slot) -> tuple[int, int, int] | None:
         """Return the colour of a slot of the left side that differs."""

@@ -82,7 +82,7 @@ class PageContents:
         self.hidden: set[str] = set()
         self.label = ""
         self.trails = True
-        self.comparing = ShownDifference(compare)
+        self.comparing = ShownDifference(compare, feed.catalogue.changes)
         self.forgotten: tuple[Slot, ...] = ()
         self.left_out = 0
         self.unfit = ""

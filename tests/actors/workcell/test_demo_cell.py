@@ -43,6 +43,8 @@ def test_cell_of_a_run_differs_only_in_what_a_run_chooses(tmp_path):
         "scale": 1.0,
     }
     shipped["actors"]["setup"].pop("args", None)
+    assert run["aspects"]["hull"].pop("voxel_m") == 0.05  # what shows the hull draws it as large
+    assert shipped["aspects"]["hull"].pop("voxel_m") == Options(tmp_path).voxel_m
     for number in range(words.CAMERA_COUNT):
         assert run["actors"][f"camera-{number}"].pop("args")["source"] == "live"
         shipped["actors"][f"camera-{number}"].pop("args")
