@@ -49,8 +49,8 @@ def path_of(array: NDArray[Any]) -> NDArray[np.float64] | None:
         with np.errstate(over="ignore"):
             is_path = np.allclose(np.linalg.norm(turns, axis=1), 1.0, atol=RIGID_TOLERANCE)
         return rows[:, :3] if is_path else None
-    if array.ndim == 3 and all(map(is_rigid, array)):
-        return np.asarray(array[:, :3, 3], np.float64) if array.shape[1:] == (4, 4) else None
+    if array.shape[1:] == (4, 4) and all(map(is_rigid, array)):
+        return np.asarray(array[:, :3, 3], np.float64)
     return None
 
 

@@ -164,20 +164,13 @@ class Canvas:
         if isinstance(node, AxesNode) and isinstance(before, AxesNode):
             handle.wxyz, handle.position = _pose(node.matrix)
             return before.colour == node.colour
-        if (
-            isinstance(node, CapsulesNode)
-            and isinstance(before, CapsulesNode)
-            and len(before.capsules) == len(node.capsules)
-            and before.colour == node.colour
-        ):
-            handle.move(node)
-            return True
-        if (
-            isinstance(node, RobotNode)
-            and isinstance(before, RobotNode)
-            and before.shapes is node.shapes
-            and before.colour == node.colour
-        ):
+        if isinstance(node, CapsulesNode) and isinstance(before, CapsulesNode):
+            same_shapes = len(before.capsules) == len(node.capsules)
+        elif isinstance(node, RobotNode) and isinstance(before, RobotNode):
+            same_shapes = before.shapes is node.shapes
+        else:
+            return False
+        if same_shapes and before.colour == node.colour:
             handle.move(node)
             return True
         return False

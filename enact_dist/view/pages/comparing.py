@@ -85,18 +85,14 @@ class ShownDifference:
         if live:
             left = Side(left.world, now_ns)
         if self.against == NOW:
-            right = Side(left.world, now_ns)
+            right, present = Side(left.world, now_ns), True
         elif self.against == MARKED:
-            right = Side(left.world, marked_ns)
+            right, present = Side(left.world, marked_ns), False
         else:
-            right = Side(self.against, left.at_ns)
+            right, present = Side(self.against, left.at_ns), live
         if not left.at_ns or not right.at_ns:
             return
-        is_others = self.against not in (NOW, MARKED)
-        key = (
-            self._key_of(left, present=live),
-            self._key_of(right, present=self.against == NOW or (live and is_others)),
-        )
+        key = (self._key_of(left, present=live), self._key_of(right, present=present))
         begun_s = time.monotonic()
         if self._key is not None:
             if key == self._key and not self._failed:
