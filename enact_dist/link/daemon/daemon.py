@@ -14,6 +14,7 @@ import logging
 import secrets
 import sys
 import threading
+import time
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -41,6 +42,7 @@ from enact_dist.link.zenoh.config import close_session, listening_settings, open
 from enact_dist.link.zenoh.discovery import FoundShard, find_shards
 from enact_dist.link.zenoh.endpoints import somebody_listens
 from enact_dist.link.zenoh.service import ZenohService
+from enact_dist.link.zenoh.tls import own_certificate
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -49,6 +51,7 @@ if TYPE_CHECKING:
     from enact_dist.core.shard.state import ShardSettings
     from enact_dist.link.daemon.metrics import MetricsServer
     from enact_dist.link.host import ShardHost
+    from enact_dist.link.zenoh.tls import Certificate, KeyFiles
 
 PROBE_S: Final = 0.3
 """How long another daemon with our name may take to answer before we start."""
@@ -81,6 +84,7 @@ class DaemonSettings:
         drain_s: How long holders may still take to finish after a signal.
         metrics: Host and port for Prometheus, see `link.daemon.metrics`; None: no server.
         written: The shard's endpoints in `cell.toml`, even if this start overrides them.
+        keys: The files by which the shard proves its name, in a cell with keys.
     """
 
     cell: str
@@ -94,6 +98,7 @@ class DaemonSettings:
     drain_s: float = DRAIN_S
     metrics: tuple[str, int] | None = None
     written: tuple[str, ...] = ()
+    keys: KeyFiles | None = None
 
 
 class RunningShard:
@@ -130,6 +135,7 @@ class RunningShard:
             self._session = open_session(
                 listen=settings.listen,
                 lease_s=settings.link_lease_s,
+                keys=settings.keys,
                 more=listening_settings(settings.cell, shard.name),
             )
             undo.callback(close_session, self._session)
@@ -140,9 +146,10 @@ class RunningShard:
                 lease_s=settings.link_lease_s,
                 answered=lambda *call: self.host.event(Called(*call)),
                 returned=lambda name: self.host.event(ShardReturned(name)),
+                keys=settings.keys,
             )
             undo.callback(self._calls.close)
-            self._comparing = Comparing(settings.cell, self.host.event)
+            self._comparing = Comparing(settings.cell, self.host.event, settings.keys)
             undo.callback(self._comparing.close)
             self.host.call_with(self._calls.submit, self._comparing.submit)
             self._service = ZenohService(self.host, self._session, settings.cell)
@@ -245,12 +252,27 @@ def start_shard(settings: DaemonSettings) -> RunningShard:
     Raises:
         StoreError: The folder is in use, unreadable or corrupt.
         LinkError: An endpoint is in use, or another daemon already serves this shard.
-        ConfigError: An endpoint cannot be read, or is missing.
+        ConfigError: An endpoint cannot be read, or is missing, or the keys cannot be used.
     """
     if not settings.listen:
         raise ConfigError(f"shard {settings.shard.name} has no endpoint to listen at")
+    if settings.keys is not None:
+        check_keys(settings.keys)
     refuse_second_daemon(settings)
     return RunningShard(settings)
+
+
+def check_keys(keys: KeyFiles) -> Certificate:
+    """Return the certificate of a shard if others will accept it now.
+
+    Raises:
+        ConfigError: They will not; the message names the file.
+    """
+    certificate = own_certificate(keys)
+    problem = certificate.problem(time.time())
+    if problem:
+        raise ConfigError(f"{keys.certificate} {problem}", path=str(keys.certificate))
+    return certificate
 
 
 def refuse_second_daemon(settings: DaemonSettings, *, probe_s: float | None = None) -> None:
@@ -272,16 +294,17 @@ def refuse_second_daemon(settings: DaemonSettings, *, probe_s: float | None = No
     expected = {entry.name: entry.endpoints for entry in shards}
     ours = (*settings.listen, *expected.get(name, ()), *settings.written)
     listening = [place for place in dict.fromkeys(map(to_reach, ours)) if somebody_listens(place)]
-    found = find_shards(listening, timeout_s=probe_s) if listening else ()
+    keys = settings.keys
+    found = find_shards(listening, timeout_s=probe_s, keys=keys) if listening else ()
     if FoundShard(cell, name) in found:
         raise LinkError(
             f"shard {name} of cell {cell} already runs at {' or '.join(listening)}; two daemons"
             " must not serve one shard: stop the other, or give this one another name"
         )
     others = [entry for entry in shards if entry.name != name]
-    reported = expected_places(cell, others, timeout_s=probe_s) if others else ()
+    reported = expected_places(cell, others, timeout_s=probe_s, keys=keys) if others else ()
     for shard, places in moved_places(expected, chain.from_iterable(reported)).items():
-        daemons = serving(cell, shard, places, timeout_s=probe_s)
+        daemons = serving(cell, shard, places, timeout_s=probe_s, keys=keys)
         if shard == name and daemons:
             raise LinkError(
                 f"shard {name} of cell {cell} already runs at {daemons[0]}, where other shards of"
