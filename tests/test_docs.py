@@ -52,7 +52,7 @@ _BLOCK = re.compile(
     re.DOTALL | re.MULTILINE,
 )
 _NAMED = re.compile(r"`(?:\.\./)*(\w+(?:[./]\w+)+)`")
-OBJECTS = {"actor", "actors", "shard", "world", "zenoh"}
+OBJECTS = {"actor", "actors", "cell", "shard", "world", "zenoh"}
 """Folders whose names stand for an object, event or file, too: `world.view`, `shard.ready`."""
 
 

@@ -10,12 +10,12 @@ from __future__ import annotations
 import datetime as dt
 import ipaddress
 import os
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from cryptography import x509
-from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
@@ -27,13 +27,17 @@ from enact_dist.link.zenoh.endpoints import split_endpoint
 from enact_dist.link.zenoh.tls import (
     AUTHORITY,
     AUTHORITY_KEY,
+    DAY_S,
+    RENEW_DAYS,
     SHARD_PREFIX,
     Certificate,
     KeyFiles,
+    hosts_missing,
+    own_certificate,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable
 
     from enact_dist.config.types import CellConfig
 
@@ -43,7 +47,8 @@ CLIENT_DAYS: Final = 365
 EARLIER: Final = dt.timedelta(minutes=5)
 """Certificates are valid from a little before they are made: clocks differ."""
 _FILE_MODE, _FOLDER_MODE = 0o600, 0o700
-_WILDCARDS: Final = ("0.0.0.0", "::")  # noqa: S104 - compared alone
+_LOOPBACKS: Final = {"0.0.0.0": "127.0.0.1", "::": "::1"}  # noqa: S104 - compared alone
+"""How programs of the same host reach a shard that listens at every address."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +91,7 @@ def owners_of(config: CellConfig) -> tuple[KeyOwner, ...]:
 
 def _hosts_of(endpoints: Iterable[str]) -> tuple[str, ...]:
     hosts = dict.fromkeys(split_endpoint(endpoint)[1].strip("[]") for endpoint in endpoints)
-    return tuple(host for host in hosts if host not in _WILDCARDS)
+    return tuple(dict.fromkeys(_LOOPBACKS.get(host, host) for host in hosts))
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,14 +195,18 @@ def write_keys(authority: Authority, owner: KeyOwner, folder: Path) -> KeyFiles:
 def put_keys(
     authority: Authority, owner: KeyOwner, folder: Path, certificate: bytes, key: bytes
 ) -> KeyFiles:
-    """Put a certificate and a private key into a key folder beside `ca.pem`."""
+    """Put a certificate and a private key into a key folder beside `ca.pem`.
+
+    If `ca.pem` has another authority, it holds both from now on: keys of either are accepted.
+    """
     make_folder(folder)
     files = KeyFiles(folder, owner.name)
     # The key goes first: a process that reads both in between refuses the pair and keeps its own.
     replace_file(files.private_key, key, mode=_FILE_MODE)
     replace_file(files.certificate, certificate, mode=_FILE_MODE)
-    if not files.authority.exists():
-        replace_file(files.authority, _pem(authority.certificate), mode=_FILE_MODE)
+    known = files.authority.read_bytes() if files.authority.exists() else b""
+    if _pem(authority.certificate) not in known:
+        replace_file(files.authority, known + _pem(authority.certificate), mode=_FILE_MODE)
     return files
 
 
@@ -229,21 +238,55 @@ def read_certificate(file: Path) -> Certificate:
     return Certificate(str(names[0].value) if names else "", hosts, *times)
 
 
-def is_signed_by(file: Path, authority: Path) -> bool:
-    """Return whether the authority whose certificate lies in a file has made another one."""
-    made = x509.load_pem_x509_certificate(file.read_bytes())
-    for one in x509.load_pem_x509_certificates(authority.read_bytes()):
-        try:
-            made.verify_directly_issued_by(one)
-        except (InvalidSignature, ValueError, TypeError):
-            continue
-        return True
-    return False
+@dataclass(frozen=True, slots=True)
+class KeyState:
+    """A name and its files in a key folder.
+
+    Attributes:
+        owner: The name, as `cell.toml` has it.
+        files: Its files, which may be missing.
+        certificate: What its certificate says, if there is one.
+        problem: What should be done; empty if nothing.
+    """
+
+    owner: KeyOwner
+    files: KeyFiles
+    certificate: Certificate | None
+    problem: str
 
 
-def names_in(folder: Path) -> list[str]:
-    """Return the names that have a certificate in a key folder."""
-    return sorted(file.stem for file in folder.glob("*.crt"))
+def key_states(folder: Path, owners: Iterable[KeyOwner], *, others: bool = False) -> list[KeyState]:
+    """Return the state of each owner's key, and of those that belong to no owner (`others`).
+
+    Raises:
+        ConfigError: A file is no certificate.
+    """
+    known = {owner.name: owner for owner in owners}
+    strange = {file.stem for file in folder.glob("*.crt")} - set(known) if others else set()
+    found = []
+    for owner in (*known.values(), *map(KeyOwner, sorted(strange))):
+        files = KeyFiles(folder, owner.name)
+        certificate = read_certificate(files.certificate) if files.certificate.exists() else None
+        problem = "make it" if certificate is None else _problem(certificate, owner, files)
+        if owner.name in strange:
+            problem = "cell.toml has no such name: delete it"
+        found.append(KeyState(owner, files, certificate, problem))
+    return found
+
+
+def _problem(found: Certificate, owner: KeyOwner, files: KeyFiles) -> str:
+    """Return what should be done about a certificate."""
+    now_s = time.time()
+    if problem := found.problem(now_s):
+        return problem
+    if missing := hosts_missing(found, owner.hosts):
+        return f"it is not for {', '.join(missing)}: renew it"
+    try:
+        own_certificate(files)
+    except ConfigError as error:
+        return str(error)
+    days = (found.ends_s - now_s) / DAY_S
+    return f"ends in {days:.0f} days: renew it" if days < RENEW_DAYS else ""
 
 
 def authority_folder(folder: Path, named: Path | None) -> Path:
@@ -303,24 +346,3 @@ def _pem(certificate: x509.Certificate) -> bytes:
 def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
     encoding, plain = serialization.Encoding.PEM, serialization.NoEncryption()
     return key.private_bytes(encoding, serialization.PrivateFormat.PKCS8, plain)
-
-
-def problem_of(
-    found: Certificate, owner: KeyOwner | None, now_s: float, warn_days: Sequence[float]
-) -> str:
-    """Return what should be done about a certificate; empty if nothing.
-
-    Args:
-        found: The certificate.
-        owner: Whose it should be; None if `cell.toml` has no such name.
-        now_s: The time now, Unix time.
-        warn_days: How many days before its end it should be renewed.
-    """
-    if problem := found.problem(now_s):
-        return problem
-    if owner is None:
-        return "belongs to no name of cell.toml"
-    if missing := [host for host in owner.hosts if host not in found.hosts]:
-        return f"is not for {', '.join(missing)}: renew it"
-    days = (found.ends_s - now_s) / 86_400
-    return f"ends in {days:.0f} days: renew it" if days < max(warn_days) else ""

@@ -27,7 +27,7 @@ from enact_dist.link.zenoh.endpoints import split_endpoint
 from enact_dist.wire.texts import shown
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Mapping
 
     from enact_dist.config.types import SecurityConfig
 
@@ -36,6 +36,9 @@ IDENTITY_VARIABLE: Final = "ENACT_IDENTITY"
 AUTHORITY: Final = "ca.pem"
 AUTHORITY_KEY: Final = "ca.key"
 SHARD_PREFIX: Final = shard_identity("")
+DAY_S: Final = 86_400.0
+RENEW_DAYS: Final = 30.0
+"""A certificate that ends within this time should be renewed."""
 LOOK_S: Final = 0.5
 """How long a look may take."""
 ALERT_S: Final = 0.2
@@ -381,14 +384,10 @@ def wrong_name(found: Certificate | None, shard: str) -> str:
     return f"the certificate there is that of {shown(found.name)}, not of {expected}"
 
 
-def fits(certificate: Certificate, endpoints: Sequence[str]) -> list[str]:
-    """Return the hosts of endpoints at which a certificate cannot serve."""
-    hosts = dict.fromkeys(split_endpoint(endpoint)[1].strip("[]") for endpoint in endpoints)
+def hosts_missing(certificate: Certificate, hosts: Iterable[str]) -> list[str]:
+    """Return the hosts for which a certificate is not."""
     named = {_plain(host) for host in certificate.hosts}
-    return [host for host in hosts if _plain(host) not in named | _WILDCARDS]
-
-
-_WILDCARDS: Final = frozenset(("0.0.0.0", "0:0:0:0:0:0:0:0", "::"))  # noqa: S104 - compared alone
+    return [host for host in hosts if _plain(host) not in named]
 
 
 def _plain(host: str) -> str:
