@@ -56,7 +56,11 @@ class KeyCell:
         days = None if seconds is None else seconds / 86_400
         authority = authority or self.authority
         made = authority.issue(owner, days=days, starts=starts)
-        return put_keys(authority, owner, folder or self.keys, *made)
+        known = (folder or self.keys) / "ca.pem"
+        before = known.read_bytes() if known.exists() else b""
+        files = put_keys(authority, owner, folder or self.keys, *made)
+        known.write_bytes(before or known.read_bytes())
+        return files
 
     def files(self, name):
         """Return the files of a name."""
