@@ -12,7 +12,7 @@ import time
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.errors import ConfigError, EnactError
-from enact_dist.link.zenoh.tls import hosts_missing, own_certificate
+from enact_dist.link.zenoh.tls import day_of, hosts_missing, own_certificate
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -93,7 +93,7 @@ class KeyWatch:
             _log.info(
                 "keys reloaded in %.0f ms; the certificate is valid until %s",
                 (time.monotonic() - began_s) * 1e3,
-                time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(self._certificate.ends_s)),
+                day_of(self._certificate.ends_s),
                 extra={"event": "shard.keys"},
             )
             return True

@@ -158,16 +158,20 @@ class Certificate:
     def problem(self, now_s: float) -> str:
         """Return why it is not valid at a time; empty if it is."""
         if now_s > self.ends_s:
-            return f"ended on {_day(self.ends_s)}; renew it: enact cell keys renew {self.name}"
+            return (
+                f"ended on {day_of(self.ends_s)} (this host's clock says {day_of(now_s)}); renew"
+                f" it: enact cell keys renew {self.name}"
+            )
         if now_s < self.starts_s:
             return (
-                f"is valid only from {_day(self.starts_s)} on, and this host's clock says"
-                f" {_day(now_s)}: correct the clock of this host, or of the one that made it"
+                f"is valid only from {day_of(self.starts_s)} on, and this host's clock says"
+                f" {day_of(now_s)}: correct the clock of this host, or of the one that made it"
             )
         return ""
 
 
-def _day(unix_s: float) -> str:
+def day_of(unix_s: float) -> str:
+    """Return a time for people."""
     return time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(unix_s))
 
 
