@@ -26,6 +26,7 @@ from enact_dist.config.types import (
     CellConfig,
     PinTable,
     RetentionTable,
+    SecurityConfig,
     ShardConfig,
 )
 
@@ -51,7 +52,7 @@ _BLOCK = re.compile(
     re.DOTALL | re.MULTILINE,
 )
 _NAMED = re.compile(r"`(?:\.\./)*(\w+(?:[./]\w+)+)`")
-OBJECTS = {"actor", "actors", "shard", "world", "zenoh"}
+OBJECTS = {"actor", "actors", "cell", "shard", "world", "zenoh"}
 """Folders whose names stand for an object, event or file, too: `world.view`, `shard.ready`."""
 
 
@@ -281,14 +282,22 @@ def test_page_of_cell_toml_has_every_key_and_no_other():
     page = (ROOT / "enact_dist" / "docs" / "cell.md").read_text("utf-8")
     tables = re.findall(r"^\| key .*\n\|---.*\n((?:\|.*\n)+)", page, re.MULTILINE)
     explained = [set(re.findall(r"^\| `(\w+)` \|", rows, re.MULTILINE)) for rows in tables]
-    kinds = (CellConfig, ShardConfig, PinTable, AspectConfig, RetentionTable, ActorConfig)
+    kinds = (
+        CellConfig,
+        SecurityConfig,
+        ShardConfig,
+        PinTable,
+        AspectConfig,
+        RetentionTable,
+        ActorConfig,
+    )
     accepted = [set(keys_of(kind)) for kind in kinds]
-    lists = {"shards", "pins", "aspects", "actors"}  # headings of the page
+    lists = {"security", "shards", "pins", "aspects", "actors"}  # headings of the page
     assert sorted(map(sorted, explained)) == sorted(sorted(keys - lists) for keys in accepted)
 
     variables = set(re.findall(r"^\| `(ENACT_\w+)` \|", page, re.MULTILINE))
     of_shards = {variable_of("name", key) for key in variables_of(ShardConfig)}
-    of_cell = {f"ENACT_{key}" for key in variables_of(CellConfig)}
+    of_cell = {f"ENACT_{k}" for kind in (CellConfig, SecurityConfig) for k in variables_of(kind)}
     assert variables == of_cell | of_shards
 
 

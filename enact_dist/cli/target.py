@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 CELL_VARIABLE: Final = "ENACT_CELL"
 CELL_DEFAULT: Final = "cell.toml"
 TIMEOUT_S: Final = 5.0
+PROGRAM: Final = "enact"
+"""How a cell sees the command line, unless an actor is named."""
 
 
 def cell_target(options: argparse.Namespace) -> str:
@@ -74,7 +76,7 @@ def open_cell(options: argparse.Namespace, *, observer: bool = True, actor: str 
     timeout_s = getattr(options, "timeout_s", TIMEOUT_S)
     return connect(
         cell_target(options),
-        actor=actor or "enact",
+        actor=actor or PROGRAM,
         timeout_s=timeout_s,
         request_timeout_s=timeout_s,
         observer=observer,

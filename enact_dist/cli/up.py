@@ -179,9 +179,15 @@ def _refuse_second(config: CellConfig, shard: ShardConfig) -> None:
     if not any(somebody_listens(endpoint) for endpoint in (*shard.listen, *elsewhere)):
         return
     from enact_dist.link.daemon.daemon import DRAIN_S, DaemonSettings, refuse_second_daemon
+    from enact_dist.link.zenoh.tls import shard_keys
     from enact_dist.operate.supervise import END_S
 
-    settings = DaemonSettings(config.name, config.shard_settings(shard.name), shard.listen)
+    settings = DaemonSettings(
+        config.name,
+        config.shard_settings(shard.name),
+        shard.listen,
+        keys=shard_keys(config.security, shard.name),
+    )
     drain_s = DRAIN_S if shard.drain_s is None else shard.drain_s
     wait_s = drain_s + END_S["shard"]
     end_s = time.monotonic() + wait_s

@@ -90,6 +90,7 @@ NOUNS: Final = {
         " outcome",
         "proof",
     ),
+    "cell": Noun("cell", "make and renew the keys of a cell", "security"),
     "demo": Noun("demo", "run a demonstration", "palletizing"),
     "workcell": Noun("workcell", "calibrate the cameras of a cell", "workcell"),
 }
@@ -167,7 +168,7 @@ class Verb:
     """One verb of a noun, or a noun that is one.
 
     Attributes:
-        name: Of the verb.
+        name: Of the verb; of two words (`keys make`) if several verbs share the first one.
         summary: What the help says of it.
         run: Its function: ``module:name`` beside the noun's table, or ``name`` in that module.
         examples: Command lines, one a line.
@@ -223,14 +224,22 @@ def add_noun(nouns: argparse._SubParsersAction[Any], name: str) -> None:
         name, help=noun.summary, description=noun.summary, epilog=f"See docs/{noun.page}.md."
     )
     verbs = parser.add_subparsers(metavar="VERB", required=True)
+    groups: dict[str, argparse._SubParsersAction[Any]] = {}
     for verb in table:
-        _add_verb(verbs, name, verb)
+        group, _, last = verb.name.rpartition(" ")
+        if group and group not in groups:
+            words = ", ".join(one.name.split()[-1] for one in table if one.name.startswith(group))
+            inner = verbs.add_parser(group, help=words, description=noun.summary)
+            groups[group] = inner.add_subparsers(metavar="VERB", required=True)
+        _add_verb(groups.get(group, verbs), name, verb, last)
 
 
-def _add_verb(verbs: argparse._SubParsersAction[Any], noun: str, verb: Verb) -> None:
+def _add_verb(
+    verbs: argparse._SubParsersAction[Any], noun: str, verb: Verb, name: str = ""
+) -> None:
     examples = verb.examples.splitlines()
     parser = verbs.add_parser(
-        verb.name,
+        name or verb.name,
         help=verb.summary,
         description=f"{verb.summary[0].upper()}{verb.summary[1:]}.{verb.details}",
         epilog="\n  ".join([f"example{'s' if examples[1:] else ''}:", *examples])

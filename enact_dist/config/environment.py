@@ -11,7 +11,8 @@ a silent default.
 `ENACT_CELL` (which cell the command line talks to), `ENACT_SHARED_FOLDER` (where processes of one
 host meet, see `link.memory.shared_folder`), `ENACT_STANDING` (whether an actor's lock waits for
 news at its shard, see `actor.running.runner`) and `ENACT_RETAIN` (whether grants are kept, see
-`link.memory.use_marks`) are no keys of the file.
+`link.memory.use_marks`) are no keys of the file.  Nor is `ENACT_IDENTITY`: which key a program
+uses whose name has none, see `link.zenoh.tls`.
 """
 
 from __future__ import annotations
@@ -24,10 +25,17 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from enact_dist.config.table import Field, fields_of, suggestion
-from enact_dist.config.types import CARRIER_DEFAULT, CellConfig, ShardConfig, is_wildcard
+from enact_dist.config.types import (
+    CARRIER_DEFAULT,
+    CellConfig,
+    SecurityConfig,
+    ShardConfig,
+    is_locked,
+    is_wildcard,
+)
 from enact_dist.errors import ConfigError
 
-T = TypeVar("T", CellConfig, ShardConfig)
+T = TypeVar("T", CellConfig, SecurityConfig, ShardConfig)
 
 
 def variables_of(kind: type) -> dict[str, Field]:
@@ -36,7 +44,8 @@ def variables_of(kind: type) -> dict[str, Field]:
 
 
 _CELL_NAMES: Final = (
-    *(f"ENACT_{name}" for name in variables_of(CellConfig)),
+    *(f"ENACT_{name}" for kind in (CellConfig, SecurityConfig) for name in variables_of(kind)),
+    "ENACT_IDENTITY",
     "ENACT_SHARED_FOLDER",
     "ENACT_RETAIN",
     "ENACT_STANDING",
@@ -54,7 +63,8 @@ def with_environment(config: CellConfig, environment: Mapping[str, str]) -> Cell
     """
     _refuse_unknown(config, [name for name in environment if name.startswith("ENACT_")])
     ours = {name: text for name, text in environment.items() if text}
-    moved = _overridden(config, "ENACT_{}".format, ours)
+    security = _overridden(config.security, "ENACT_{}".format, ours)
+    moved = dataclasses.replace(_overridden(config, "ENACT_{}".format, ours), security=security)
     shards = tuple(
         _shard(shard, config.data_folder, moved.data_folder, ours) for shard in config.shards
     )
@@ -80,6 +90,12 @@ def carrier_of(environment: Mapping[str, str]) -> str:
     text = environment.get("ENACT_CARRIER") or CARRIER_DEFAULT
     carrier: str = _read("ENACT_CARRIER", text, variables_of(CellConfig)["CARRIER"])
     return carrier
+
+
+def security_of(environment: Mapping[str, str], endpoint: str) -> SecurityConfig:
+    """Return the keys that the environment names, for an endpoint without a `cell.toml`."""
+    none = SecurityConfig()
+    return _overridden(none, "ENACT_{}".format, environment) if is_locked(endpoint) else none
 
 
 def variable_of(shard: str, key: str) -> str:

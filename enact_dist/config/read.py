@@ -49,7 +49,13 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.config.environment import with_environment
 from enact_dist.config.lines import LineLocator
 from enact_dist.config.table import ConfigSource, Table, suggestion
-from enact_dist.config.types import ActorProcess, CellConfig, ShardConfig, is_wildcard
+from enact_dist.config.types import (
+    ActorProcess,
+    CellConfig,
+    ShardConfig,
+    is_locked,
+    is_wildcard,
+)
 from enact_dist.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -109,7 +115,9 @@ def parse_config(
         raise ConfigError(f"{shown}, line {line}: {error}", path=shown, line=line) from error
     root = Table(values, (), ConfigSource(shown, LineLocator(text), file.parent))
     config = _cell(root, file)
-    return with_environment(config, os.environ if environment is None else environment)
+    config = with_environment(config, os.environ if environment is None else environment)
+    _check_doors(root, config)
+    return config
 
 
 def _cell(root: Table, file: Path) -> CellConfig:
@@ -155,6 +163,30 @@ def _shards(root: Table, config: CellConfig) -> tuple[ShardConfig, ...]:
     if not shards:
         root.refuse("shards", "the cell has no shard; write a table [shards.NAME] with listen")
     return tuple(shards)
+
+
+def _check_doors(root: Table, config: CellConfig) -> None:
+    """Refuse an open endpoint in a cell with keys, and a locked one in a cell without.
+
+    Raises:
+        ConfigError: A shard has such an endpoint, from the file or from a variable.
+    """
+    has_keys = config.security.keys is not None
+    for shard in config.shards:
+        table = root.table("shards").table(shard.name)
+        for key, endpoints in (("listen", shard.listen), ("advertise", shard.advertise)):
+            for endpoint in endpoints:
+                if is_locked(endpoint) == has_keys:
+                    continue
+                locked = "tls/" + endpoint.partition("/")[2]
+                problem = (
+                    f"{endpoint} of shard {shard.name} is a door without a lock: the cell has keys,"
+                    f" and any program can connect there without one; write {locked}"
+                    if has_keys
+                    else f"{endpoint} of shard {shard.name} needs keys: write [security] with"
+                    ' keys = "keys", or set ENACT_KEYS (docs/security.md explains how to make them)'
+                )
+                table.refuse(key if key in table.values else "listen", problem)
 
 
 def _check_actors(root: Table, config: CellConfig) -> None:

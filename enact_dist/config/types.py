@@ -40,14 +40,14 @@ TTL_S_MAX: Final = 60.0
 DRAIN_S_MAX: Final = 3600.0
 """Default duration of `enact lock hold`."""
 
-_ENDPOINT: Final = re.compile(r"tcp/(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):(\d{1,5})\Z")
+_ENDPOINT: Final = re.compile(r"(?:tcp|tls)/(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):(\d{1,5})\Z")
 _ADDRESS: Final = re.compile(r"((\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)?:)?\d{1,5}\Z")
 _DOTTED_NAME: Final = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*\Z")
 _WILDCARDS: Final = ("0.0.0.0", "[::]")  # noqa: S104 - recognised here in order to be refused
 
 
 def checked_endpoint(endpoint: str) -> str:
-    """Return `endpoint` if it has the form ``tcp/host:port``.
+    """Return `endpoint` if it has the form ``tcp/host:port`` or ``tls/host:port``.
 
     Raises:
         ValueError: It has another form, or a port outside 1 to 65535.
@@ -56,7 +56,7 @@ def checked_endpoint(endpoint: str) -> str:
     if found is None or not 1 <= int(found[2]) <= 65_535:
         raise ValueError(
             f"{endpoint!r} is no endpoint; write tcp/host:port with a port from 1 to 65535,"
-            " such as tcp/127.0.0.1:7447"
+            " such as tcp/127.0.0.1:7447, or tls/host:port in a cell with keys"
         )
     return endpoint
 
@@ -74,6 +74,11 @@ def metrics_address(text: str) -> tuple[str, int]:
             " as 127.0.0.1:9464 or 9464"
         )
     return host.strip("[]") or "127.0.0.1", int(port)
+
+
+def is_locked(endpoint: str) -> bool:
+    """Return whether only programs with a key of the cell can connect to an endpoint."""
+    return endpoint.startswith("tls/")
 
 
 def is_wildcard(endpoint: str) -> bool:
@@ -133,6 +138,30 @@ class ShardConfig:
         tuple[str, int] | None, TableKey(make=metrics_address, variable="METRICS")
     ] = None
     drain_s: Annotated[float | None, _DRAIN] = None
+
+
+@dataclass(frozen=True, slots=True)
+class SecurityConfig:
+    """The keys of a cell; without them, any program that reaches a port can join.
+
+    Attributes:
+        keys: The folder with this host's certificates and private keys; ``None``: the cell has
+            none.
+        operators: Names of people and tools that have a key, beside the shards and actors.
+    """
+
+    keys: Annotated[Path | None, TableKey(variable="KEYS")] = None
+    operators: Annotated[
+        tuple[str, ...], TableKey(make=partial(checked_name, "operator", slashes=False))
+    ] = ()
+
+
+def _security(found: object) -> SecurityConfig:
+    if not isinstance(found, SecurityConfig):
+        raise ValueError(  # noqa: TRY004 - what a table's reader catches
+            "'security' is a table; write [security] and below it keys = \"keys\""
+        )
+    return found
 
 
 class PinTable(NamedTuple):
@@ -250,6 +279,7 @@ class CellConfig:
         carrier: How messages travel between processes.
         shared_bytes_max: Cap of each shard's large data in shared memory, bytes.
         data_folder: Where shards without a `folder` of their own keep theirs, or ``None``.
+        security: The keys of the cell.
         worlds: World contexts that exist from the start.
         shards: At least one, in the order of the file.
         pins: Entities kept on one shard; the first pin that matches wins.
@@ -265,6 +295,9 @@ class CellConfig:
     carrier: Annotated[str, TableKey(choices=CARRIERS, variable="CARRIER")] = CARRIER_DEFAULT
     shared_bytes_max: Annotated[int | None, TableKey(variable="SHARED_BYTES_MAX")] = None
     data_folder: Annotated[Path | None, TableKey(variable="DATA_FOLDER")] = None
+    security: Annotated[SecurityConfig, TableKey(table=SecurityConfig, make=_security)] = (
+        SecurityConfig()
+    )
     worlds: Annotated[
         tuple[str, ...], TableKey(make=partial(checked_name, "world context", slashes=False))
     ] = ()

@@ -194,5 +194,11 @@ class Carrier(Protocol):
     def endpoint_of(self, shard: str) -> str:
         """Return the shard's expected endpoint, for messages to people."""
 
+    def reason_away(self, shard: str) -> str:
+        """Return why a shard's certificate or ours is refused; empty if that is not the reason.
+
+        Takes up to 0.5 s, so ask only for the error about a shard that does not answer.
+        """
+
     def close(self) -> None:
         """End all connections and pending calls (they return None); idempotent."""

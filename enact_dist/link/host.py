@@ -173,7 +173,7 @@ class ShardHost:
         self._watchers: tuple[Callable[[Notice], None], ...] = ()
         self._call: Callable[[str, Request], None] | None = None
         self._compare: Callable[[Compare], None] = lambda _: None
-        self._inboxes: tuple[Callable[[], None], ...] = ()
+        self._inboxes: dict[Callable[[], None], Callable[[], object]] = {}  # and what removes it
         self._each_tick: tuple[Callable[[], None], ...] = ()
         self._failure: Exception | None = None
         self._ended = False
@@ -319,9 +319,9 @@ class ShardHost:
             self._watchers = (*self._watchers, watcher)
         return unwatch
 
-    def add_inbox(self, drain: Callable[[], None]) -> None:
-        """Call `drain` before each tick; it submits requests that have already arrived."""
-        self._inboxes = (*self._inboxes, drain)
+    def add_inbox(self, drain: Callable[[], None]) -> Callable[[], object]:
+        """Call `drain` before each tick to submit requests that are here; return what ends this."""
+        return self._inboxes.setdefault(drain, lambda: self._inboxes.pop(drain, None))
 
     def each_tick(self, act: Callable[[], None]) -> None:
         """Call `act` after each tick, so at least every `TICK_S_MAX` while the shard works.
@@ -419,7 +419,7 @@ class ShardHost:
 
     def tick(self) -> int:
         """Submit arrived requests, then advance time; return when the next tick is due, in ns."""
-        for drain in self._inboxes:
+        for drain in tuple(self._inboxes):
             drain()
         if drafts := self._payloads.drafts():
             with self._mutex:

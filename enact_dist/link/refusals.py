@@ -35,9 +35,8 @@ from enact_dist.errors import (
 from enact_dist.terms import ACCESSES
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from enact_dist.core.protocol.messages import Answer, Holder, Item
+    from enact_dist.link.carrier import Carrier
 
 
 _CLASSES: Final[dict[str, type[EnactError]]] = {
@@ -56,11 +55,12 @@ _CLASSES: Final[dict[str, type[EnactError]]] = {
 
 
 def unreachable(
-    shard: str, waited_s: float, endpoint_of: Callable[[str], str], *, runs: bool = False
+    shard: str, waited_s: float, carrier: Carrier, *, runs: bool = False
 ) -> ShardUnreachableError:
     """Return the error for a shard that does not answer, though it may run (`runs`)."""
-    endpoint = endpoint_of(shard)
-    advice = (
+    endpoint = carrier.endpoint_of(shard)
+    refused = "" if runs else carrier.reason_away(shard)
+    advice = refused or (
         f"is it running? (enact shard ls; enact shard run {shard})"
         if not runs
         else "it runs, so its disk may be stalled: see its log"
@@ -75,14 +75,14 @@ def unreachable(
 def not_granted(
     lock: MultiLock,
     waited_s: float,
-    endpoint_of: Callable[[str], str],
+    carrier: Carrier,
     asked: tuple[Item, ...],
 ) -> EnactError:
     """Return the error for a lock, or a view, that ended before it was granted."""
     if lock.phase is Phase.REFUSED and lock.refusal is not None:
         return error_of(lock.refusal)
     if lock.phase is Phase.UNREACHABLE:
-        return unreachable(lock.silent_shard, waited_s, endpoint_of)
+        return unreachable(lock.silent_shard, waited_s, carrier)
     wanted = _wanted(lock)
     if lock.plan.past_ns:
         return LockTimeoutError(
@@ -120,7 +120,7 @@ def not_granted(
 
 
 def not_committed(
-    lock: MultiLock, finish_s: float, endpoint_of: Callable[[str], str], *, name: str = ""
+    lock: MultiLock, finish_s: float, carrier: Carrier, *, name: str = ""
 ) -> EnactError:
     """Return the error for a lock that ended without committing.
 
@@ -137,7 +137,7 @@ def not_committed(
             lock_id=name,
         )
     if lock.phase is Phase.UNREACHABLE:
-        return unreachable(lock.silent_shard, finish_s, endpoint_of)
+        return unreachable(lock.silent_shard, finish_s, carrier)
     if lock.phase is Phase.CHANGED:
         return ChangedError(
             f"{lock.cause}; nothing was written: take the lock again and redo the work with the"

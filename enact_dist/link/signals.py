@@ -74,6 +74,7 @@ class StopSignals:
         self.before: dict[signal.Signals, Callable[[int, FrameType | None], object] | int | None]
         self._acts: list[Callable[[str], None]] = []
         self._acts_again: list[Callable[[str], None]] = []
+        self._others: dict[int, Callable[[], object]] = {}
         self._mutex = threading.Lock()
         self._name = ""
         self._thread = threading.Thread(target=self._serve, name="enact-signals", daemon=True)
@@ -111,9 +112,20 @@ class StopSignals:
         with self._mutex:
             self._acts_again.append(act)
 
+    def call_at(self, number: signal.Signals, act: Callable[[], object]) -> None:
+        """Call `act` at each signal of another number, until the block ends.  Main thread only."""
+        self._others[number] = act
+        self.before[number] = signal.signal(number, _do_nothing)
+
     def _serve(self) -> None:
         first_s = 0.0
         while (number := self._numbers.recv(1)[0]) != _END:
+            if (other := self._others.get(number)) is not None:
+                try:
+                    other()
+                except Exception:  # noqa: BLE001 - the next signal may be to end
+                    _log.exception("an action on signal %d has failed", number)
+                continue
             if number not in STOPPING:
                 continue  # for another handler
             now_s = time.monotonic()

@@ -17,6 +17,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.config.types import is_locked
 from enact_dist.core.state.clock import is_kept, state_of
 from enact_dist.errors import ConfigError, EnactError, ShardUnreachableError
 from enact_dist.link.memory.shared_folder import MEMORY, SHARED_FOLDER_VARIABLE
@@ -29,6 +30,7 @@ from enact_dist.operate.doctor_cell import (
     ok,
     warn,
 )
+from enact_dist.operate.doctor_keys import keys
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterator
@@ -83,6 +85,7 @@ def examine(target: str, *, timeout_s: float = 5.0) -> Iterator[Finding]:
             yield fail("cell.toml", str(error), "correct the file")
             return
         yield ok("cell.toml", f"{target}: cell {config.name}, {_counts(config)}")
+        yield from keys(config)
     kept = yield from _cell(target, config, timeout_s)
     if config is not None:
         yield from folders(config, kept)
@@ -329,7 +332,7 @@ def _unreachable(subject: str, endpoint: str) -> Finding:
 
 
 def knock(endpoint: str, *, timeout_s: float = 2.0) -> tuple[str, str]:
-    """Say why a ``tcp/host:port`` endpoint may not answer, and what to do about it."""
+    """Say why an endpoint such as ``tcp/host:port`` may not answer, and what to do about it."""
     host, _, port = endpoint.partition("/")[2].rpartition(":")
     host = host.strip("[]")
     try:
@@ -345,4 +348,6 @@ def knock(endpoint: str, *, timeout_s: float = 2.0) -> tuple[str, str]:
         return "no packet comes back", f"look for a firewall in front of port {port} of {host}"
     except (OSError, ValueError) as error:
         return str(error), f"look at the network: ping {host}"
+    if is_locked(endpoint):
+        return "something listens, but no connection comes about", "see the check of its key"
     return "something listens, but it is no shard of this cell", f"see what runs at port {port}"

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.parts import PlacementMap
     from enact_dist.world.listings import ShardInfo
 
+ACTOR: Final = "enact"
+"""How the cell sees these checks."""
 ASK_S: Final = 0.5
 """How long each place at which a shard is expected may take to say which daemon serves it."""
 DISK_BYTES_WARN: Final = 1_000_000_000
@@ -118,18 +120,25 @@ def duplicate_daemons(
 
     Each shard is asked, too, at which further places others have named it.
     """
+    from enact_dist.config.environment import security_of
     from enact_dist.link.client.duplicate_daemons import expected_places, serving, two_daemons
+    from enact_dist.link.zenoh.tls import client_keys
 
     entries = [entry for welcome in welcomes.values() for entry in welcome.placement.shards]
+    place = next((place for entry in entries for place in entry.endpoints), "")
+    security = security_of(os.environ, place) if config is None else config.security
+    keys = client_keys(security, ACTOR)
     if config is not None:
         entries += config.placement_map().shards
-    for told in expected_places(cell, list(dict.fromkeys(entries)), timeout_s=ASK_S):
+    for told in expected_places(cell, list(dict.fromkeys(entries)), timeout_s=ASK_S, keys=keys):
         entries += told
     places: dict[str, dict[str, None]] = {}
     for entry in entries:
         places.setdefault(entry.name, {}).update(dict.fromkeys(entry.endpoints))
     for shard, endpoints in places.items():
-        found = serving(cell, shard, endpoints, timeout_s=ASK_S) if len(endpoints) > 1 else ()
+        if len(endpoints) < 2:
+            continue
+        found = serving(cell, shard, endpoints, timeout_s=ASK_S, keys=keys)
         if len(found) > 1:
             wrong, _, remedy = two_daemons(cell, shard, found).partition("; ")
             yield fail(f"shard {shard}", wrong, remedy)

@@ -8,7 +8,7 @@ import socket
 import sys
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from enact_dist.access.arguments import check_seconds, checked_as
 from enact_dist.core.client.client import Client
@@ -22,7 +22,7 @@ from enact_dist.world.cell import Cell
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from enact_dist.config.types import CellConfig
+    from enact_dist.config.types import CellConfig, SecurityConfig
     from enact_dist.link.clock import Clock
 
 TTL_S: Final = 2.0
@@ -55,13 +55,14 @@ def connect(
 
     Raises:
         ShardUnreachableError: No shard answered in time; the message names shards and endpoints.
-        ConfigError: The `cell.toml` cannot be used, or `target` is neither file nor endpoint.
+        ConfigError: The `cell.toml` cannot be used, `target` is neither file nor endpoint, or the
+            cell has keys and this host none that can be used.
         MisuseError: A time is negative or not a number, or this process was forked from one that
             has been connected (see `Cell`).
     """
-    from enact_dist.config.environment import carrier_of
     from enact_dist.link.client.joining import join
     from enact_dist.link.zenoh.config import OPEN_S
+    from enact_dist.link.zenoh.tls import client_keys
 
     if patience_s is not None:
         text = "connect(patience_s=…) is now connect(request_timeout_s=…)"
@@ -69,26 +70,17 @@ def connect(
         request_timeout_s = patience_s
     for word, waits_s in (("timeout_s", timeout_s), ("request_timeout_s", request_timeout_s)):
         check_seconds(word, waits_s)
-    name, ttl_s, carrier = "", TTL_S, carrier_of(os.environ)
-    endpoints: tuple[str, ...] = (str(target),)
-    expected: tuple[ShardEntry, ...] = ()
-    if not _is_endpoint(target):
-        from enact_dist.config.read import load_config
-
-        _refuse_no_file(target)
-        config = load_config(Path(target))
-        name, ttl_s, carrier = config.name, config.ttl_s, config.carrier
-        expected = config.placement_map().shards
-        endpoints = tuple(e for entry in expected for e in entry.endpoints)
-    client = _client(actor, ttl_s=ttl_s, observer=observer)
+    known = _known_of(target)
+    client = _client(actor, ttl_s=known.ttl_s, observer=observer)
     cell_name, cell_client, welcome = join(
-        name,
-        endpoints,
+        known.name,
+        known.endpoints,
         client,
         timeout_s=timeout_s,
         open_s=min(OPEN_S, request_timeout_s),
-        carrier=carrier,
-        expected=expected,
+        carrier=known.carrier,
+        expected=known.expected,
+        keys=client_keys(known.security, client.actor),
     )
     cell_client.request_timeout_s = request_timeout_s
     try:
@@ -97,6 +89,37 @@ def connect(
         cell_client.close()
         raise
     return Cell(cell_name, cell_client)
+
+
+class _Known(NamedTuple):
+    """What a target says of its cell before a shard has answered."""
+
+    name: str
+    ttl_s: float
+    carrier: str
+    endpoints: tuple[str, ...]
+    expected: tuple[ShardEntry, ...]
+    security: SecurityConfig
+
+
+def _known_of(target: str | Path) -> _Known:
+    """Read a `cell.toml`, or the environment beside an endpoint.
+
+    Raises:
+        ConfigError: It is neither, or cannot be used.
+    """
+    from enact_dist.config.environment import carrier_of, security_of
+    from enact_dist.config.read import load_config
+
+    if _is_endpoint(target):
+        place = str(target)
+        security = security_of(os.environ, place)
+        return _Known("", TTL_S, carrier_of(os.environ), (place,), (), security)
+    _refuse_no_file(target)
+    config = load_config(Path(target))
+    expected = config.placement_map().shards
+    endpoints = tuple(e for entry in expected for e in entry.endpoints)
+    return _Known(config.name, config.ttl_s, config.carrier, endpoints, expected, config.security)
 
 
 def local(

@@ -326,13 +326,18 @@ def _asked_info(client: CellClient, shard: str) -> ShardInfo:
         # Its welcome names the carrier of later calls.  A silent shard is waited for only once.
         hello = (shard, client.core.hello(shard))
         if client.call_once([hello, question])[1] is None:
-            return ShardInfo(shard, endpoint, reachable=False)
+            return _silent(client, shard, endpoint)
     started_s = time.monotonic()
     answer = client.call_once([question])[0]
     round_trip_s = time.monotonic() - started_s
     if not isinstance(answer, Sessions):
-        return ShardInfo(shard, endpoint, reachable=False)
+        return _silent(client, shard, endpoint)
     return answered_info(client, shard, answer, round_trip_s)
+
+
+def _silent(client: CellClient, shard: str, endpoint: str) -> ShardInfo:
+    problem = client.carrier.reason_away(shard)
+    return ShardInfo(shard, endpoint, reachable=False, problem=problem)
 
 
 def answered_info(

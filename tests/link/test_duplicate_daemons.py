@@ -8,6 +8,7 @@ import pytest
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
 from enact_dist.cli.shard.shard import _state
+from enact_dist.config.types import SecurityConfig
 from enact_dist.core.protocol.messages import (
     ListPlaces,
     ListSessions,
@@ -166,7 +167,8 @@ def test_doctor_asks_at_each_place_that_file_and_shards_name(begin, free):
     begin("left", first, left=first)
     begin("left", second, left=second)
     file = SimpleNamespace(
-        placement_map=lambda: PlacementMap(1, (ShardEntry("left", (second,)),), ())
+        security=SecurityConfig(),
+        placement_map=lambda: PlacementMap(1, (ShardEntry("left", (second,)),), ()),
     )
     with connect(first) as cell:
         (finding,) = duplicate_daemons("cell", file, cell.welcomes())
@@ -272,7 +274,9 @@ def test_running_shards_notice_a_daemon_that_comes_back_beside_its_successor(
         (shown,) = [shard for shard in cell.shards() if shard.name == "right"]
         assert "SHARDS RUNNING TWICE: 1" in _state(shown)
     entries = (ShardEntry("left", (first,)), ShardEntry("right", (right,)))
-    file = SimpleNamespace(placement_map=lambda: PlacementMap(1, entries, ()))
+    file = SimpleNamespace(
+        placement_map=lambda: PlacementMap(1, entries, ()), security=SecurityConfig()
+    )
     (finding,) = duplicate_daemons("cell", file, {})
     assert (finding.subject, second in finding.text) == ("shard left", True)
 

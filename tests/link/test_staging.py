@@ -28,6 +28,7 @@ class Way:
             inside=False,
             fetch_bytes=SLICE,
             endpoint_of=lambda shard: f"tcp/{shard}:1",
+            reason_away=lambda _: "",
             request_all=lambda calls, **_: [self.desks[s].stage(m) for s, m in calls],
         )
         self.request_timeout_s = 10.0

@@ -27,7 +27,9 @@ class Way:
     def __init__(self, data=(), *, slice_bytes=SLICE):
         self.data = dict(data)
         self.carrier = SimpleNamespace(
-            fetch_bytes=slice_bytes, endpoint_of=lambda shard: f"tcp/{shard}:1"
+            fetch_bytes=slice_bytes,
+            endpoint_of=lambda shard: f"tcp/{shard}:1",
+            reason_away=lambda _: "",
         )
         self.request_timeout_s = 10.0
         self.asked, self.under_way, self.most_bytes = [], {}, 0

@@ -78,6 +78,19 @@ VERBS: Final = (
         defaults={"timeout_s": CHECK_S},
     ),
     Verb(
+        "reload",
+        "let running shards of this host read their key files again; sessions and locks stay",
+        "reload:reload_shards",
+        "enact shard reload left --cell cell.toml\nenact shard reload --all",
+        (
+            option("name", "NAME", "name of the shard", nargs="?"),
+            flag("--all", "all shards of this host"),
+            CELL_FILE,
+            JSON,
+        ),
+        page="security",
+    ),
+    Verb(
         "rebalance", "move entities to where cell.toml places them, while the cell is stopped",
         "rebalance:run_rebalance",
         "enact shard rebalance --cell cell.toml --new third --dry-run\n"

@@ -6,7 +6,7 @@ import os
 import sys
 from typing import TYPE_CHECKING
 
-from enact_dist.cli.target import cell_target, is_endpoint, open_cell
+from enact_dist.cli.target import PROGRAM, cell_target, is_endpoint, open_cell
 from enact_dist.cli.text.output import print_table, shown_bytes
 from enact_dist.cli.verbs import DONE, FAILED, UNREACHABLE, Output
 from enact_dist.core.state.clock import state_of
@@ -27,6 +27,7 @@ def run_shard(options: argparse.Namespace) -> int:
     from enact_dist.config.environment import variable_of
     from enact_dist.config.read import load_config
     from enact_dist.link.daemon import daemon as shard_daemon
+    from enact_dist.link.zenoh.tls import shard_keys
 
     target = cell_target(options)
     if is_endpoint(target):
@@ -57,6 +58,7 @@ def run_shard(options: argparse.Namespace) -> int:
             shared_bytes_max=config.shared_bytes_max,
             metrics=shard.metrics,
             written=written.advertise,
+            keys=shard_keys(config.security, shard.name),
             drain_s=shard_daemon.DRAIN_S if drain_s is None else drain_s,
         )
     )
@@ -105,11 +107,14 @@ def check_shards(options: argparse.Namespace) -> Output:
 
 
 def _health(options: argparse.Namespace) -> list[ShardHealth]:
+    from enact_dist.config.environment import security_of
     from enact_dist.link.daemon import health as shard_health
+    from enact_dist.link.zenoh.tls import client_keys
 
-    target = cell_target(options)
+    target, wait_s = cell_target(options), options.timeout_s
     if is_endpoint(target):
-        return shard_health.of_endpoint(target, options.name, timeout_s=options.timeout_s)
+        keys = client_keys(security_of(os.environ, target), PROGRAM)
+        return shard_health.of_endpoint(target, options.name, timeout_s=wait_s, keys=keys)
     from enact_dist.config.read import load_config
 
     config = load_config(target)
@@ -117,7 +122,8 @@ def _health(options: argparse.Namespace) -> list[ShardHealth]:
     endpoints = {
         name: (*config.shard(name).advertise, *config.shard(name).listen) for name in names
     }
-    return shard_health.of_shards(config.name, endpoints, timeout_s=options.timeout_s)
+    keys = client_keys(config.security, PROGRAM)
+    return shard_health.of_shards(config.name, endpoints, timeout_s=wait_s, keys=keys)
 
 
 def _row(shard: ShardInfo) -> tuple[object, ...]:

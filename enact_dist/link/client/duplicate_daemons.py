@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.messages import ListPlaces, Ping, Places, Pong
 from enact_dist.core.protocol.records import Served
-from enact_dist.errors import ConfigError
+from enact_dist.errors import ConfigError, ShardUnreachableError
 from enact_dist.link.zenoh.config import to_reach
 from enact_dist.link.zenoh.discovery import FoundShard, ask_shards
 from enact_dist.link.zenoh.endpoints import PROTOCOLS, somebody_listens, split_endpoint
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
     from enact_dist.core.protocol.messages import ShardEntry
     from enact_dist.core.protocol.records import Compare
+    from enact_dist.link.zenoh.tls import KeyFiles
 
 _log = logging.getLogger("enact.link")
 
@@ -51,7 +52,12 @@ class Serving:
 
 
 def serving(
-    cell: str, shard: str, endpoints: Iterable[str], *, timeout_s: float
+    cell: str,
+    shard: str,
+    endpoints: Iterable[str],
+    *,
+    timeout_s: float,
+    keys: KeyFiles | None = None,
 ) -> tuple[Serving, ...]:
     """Ask endpoint by endpoint which daemon serves a shard there; return each daemon once.
 
@@ -62,31 +68,36 @@ def serving(
     """
     found: dict[int, Serving] = {}
     for endpoint in dict.fromkeys(map(to_reach, endpoints)):
-        if (one := _serving_at(cell, shard, endpoint, timeout_s)) is not None:
+        if (one := _serving_at(cell, shard, endpoint, timeout_s, keys)) is not None:
             found.setdefault(one.start, one)
     if len(found) < 2:
         return tuple(found.values())
     # A daemon that restarted between two questions has answered as two; the earlier one is gone.
-    again = (_serving_at(cell, shard, one.endpoint, timeout_s) or one for one in found.values())
+    again = (
+        _serving_at(cell, shard, one.endpoint, timeout_s, keys) or one for one in found.values()
+    )
     return tuple({one.start: one for one in again}.values())
 
 
-def _serving_at(cell: str, shard: str, endpoint: str, timeout_s: float) -> Serving | None:
+def _serving_at(
+    cell: str, shard: str, endpoint: str, timeout_s: float, keys: KeyFiles | None
+) -> Serving | None:
     if split_endpoint(endpoint)[0] not in PROTOCOLS or not somebody_listens(endpoint):
         return None
     wanted = FoundShard(cell, shard)
     try:
-        answer = ask_shards([endpoint], [wanted], Ping(), timeout_s=timeout_s).get(wanted)
-    except ConfigError as error:
+        answers = ask_shards([endpoint], [wanted], Ping(), timeout_s=timeout_s, keys=keys)
+    except (ConfigError, ShardUnreachableError) as error:  # or another shard answers in its name
         _log.warning("shard %s is announced at an invalid endpoint: %s", shard, error)
         return None
+    answer = answers.get(wanted)
     if not isinstance(answer, Pong):
         return None
     return Serving(endpoint, answer.start, answer.epoch, answer.uptime_ns / 1e9)
 
 
 def expected_places(
-    cell: str, shards: Sequence[ShardEntry], *, timeout_s: float
+    cell: str, shards: Sequence[ShardEntry], *, timeout_s: float, keys: KeyFiles | None = None
 ) -> list[tuple[ShardEntry, ...]]:
     """Ask shards of a cell where they expect each shard; return their answers.
 
@@ -99,7 +110,9 @@ def expected_places(
     endpoints = dict.fromkeys(to_reach(place) for entry in shards for place in entry.endpoints)
     listening = [endpoint for endpoint in endpoints if somebody_listens(endpoint)]
     asked = [FoundShard(cell, entry.name) for entry in shards]
-    answers = ask_shards(listening, asked, ListPlaces(), timeout_s=timeout_s) if listening else {}
+    if not listening:
+        return []
+    answers = ask_shards(listening, asked, ListPlaces(), timeout_s=timeout_s, keys=keys)
     return [one.shards for one in answers.values() if isinstance(one, Places)]
 
 
@@ -136,6 +149,7 @@ class Comparing:
     Args:
         cell: Name of the cell.
         report: Receives the result.
+        keys: The files by which this process proves its name, in a cell with keys.
     """
 
     ASK_S: Final = 0.5
@@ -145,8 +159,10 @@ class Comparing:
     LATER_S: Final = 30.0
     """Pause before the next check, once only one of them answers."""
 
-    def __init__(self, cell: str, report: Callable[[Served], None]) -> None:
-        self._cell, self._report = cell, report
+    def __init__(
+        self, cell: str, report: Callable[[Served], None], keys: KeyFiles | None = None
+    ) -> None:
+        self._cell, self._report, self._keys = cell, report, keys
         self._asked: dict[str, Compare] = {}
         self._doubled: set[str] = set()
         self._were_doubled: dict[str, Compare] = {}
@@ -175,7 +191,13 @@ class Comparing:
     def _run(self) -> None:
         while (compare := self._next()) is not None:
             try:
-                found = serving(self._cell, compare.shard, compare.places, timeout_s=self.ASK_S)
+                found = serving(
+                    self._cell,
+                    compare.shard,
+                    compare.places,
+                    timeout_s=self.ASK_S,
+                    keys=self._keys,
+                )
             except Exception as error:  # noqa: BLE001 - a place from a configuration may be anything
                 if not self._closed:
                     _log.warning(
@@ -218,6 +240,7 @@ class Doubts:
     Args:
         cell: Name of the cell.
         expected: The shards and endpoints that the session's user configured.
+        keys: The files by which this process proves its name, in a cell with keys.
     """
 
     ASK_S: Final = 0.5
@@ -225,8 +248,10 @@ class Doubts:
     AGAIN_S: Final = 2.0
     """Pause before checking whether the doubt is over."""
 
-    def __init__(self, cell: str, expected: Iterable[ShardEntry] = ()) -> None:
-        self._cell = cell
+    def __init__(
+        self, cell: str, expected: Iterable[ShardEntry] = (), keys: KeyFiles | None = None
+    ) -> None:
+        self._cell, self._keys = cell, keys
         self._known = {entry.name: list(entry.endpoints) for entry in expected}
         self.doubted: dict[str, tuple[list[str], str, float]] = {}
 
@@ -245,7 +270,7 @@ class Doubts:
         return wrong
 
     def _ask(self, shard: str, places: list[str]) -> str:
-        found = serving(self._cell, shard, places, timeout_s=self.ASK_S)
+        found = serving(self._cell, shard, places, timeout_s=self.ASK_S, keys=self._keys)
         if len(found) < 2:
             self.doubted.pop(shard, None)
             return ""

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from enact_dist.core.client.client import Client
     from enact_dist.core.protocol.messages import ShardEntry
     from enact_dist.link.carrier import Carrier
+    from enact_dist.link.zenoh.tls import KeyFiles
 
 HELLO_S: Final = 1.0
 """How long another shard may take to welcome us if the first one's socket is unusable."""
@@ -36,6 +37,7 @@ def join(
     open_s: float = OPEN_S,
     carrier: str = "auto",
     expected: Sequence[ShardEntry] = (),
+    keys: KeyFiles | None = None,
 ) -> tuple[str, CellClient, Welcome]:
     """Return the cell's name, a client with an open carrier, and a shard's welcome.
 
@@ -47,13 +49,14 @@ def join(
         open_s: How long a shard has to answer a connection.
         carrier: How messages travel, one of `CARRIERS`.
         expected: The shards and endpoints of `cell.toml`.
+        keys: The files by which this process proves its name, in a cell with keys.
 
     Raises:
         LinkError: Another cell answers, or a socket is required and no shard has a usable one
             (raised only after `timeout_s` if the first shard has none and another does not answer).
         ShardUnreachableError: None answered; the message names the endpoints.
     """
-    found, welcome = discover(endpoints, client.hello(""), timeout_s=timeout_s)
+    found, welcome = discover(endpoints, client.hello(""), timeout_s=timeout_s, keys=keys)
     if name and found != name:
         raise LinkError(
             f"a shard of cell {found!r} answers at {', '.join(endpoints)}, not one of {name!r};"
@@ -70,6 +73,7 @@ def join(
         tuple(dict.fromkeys((*endpoints, *reachable))),
         ttl_s=client.ttl_ns / 1e9,
         open_s=open_s,
+        keys=keys,
     )
     way: Carrier = zenoh
     try:
@@ -82,7 +86,7 @@ def join(
     except BaseException:
         way.close()
         raise
-    return found, CellClient(way, client, doubts=Doubts(found, expected)), welcome
+    return found, CellClient(way, client, doubts=Doubts(found, expected, keys)), welcome
 
 
 def _first_usable(

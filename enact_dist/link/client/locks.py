@@ -173,7 +173,7 @@ class CellClient(SessionClient):
             if lock_views:
                 self.count("views_locked")
         waited_s = (self._now_ns() - started_ns) / 1e9
-        raise not_granted(lock, waited_s, self.carrier.endpoint_of, asked.items)
+        raise not_granted(lock, waited_s, self.carrier, asked.items)
 
     def stands_alone(self, items: tuple[Item, ...]) -> bool:
         """Whether a lock of these lies on one shard, so that it can wait there for news."""
@@ -373,7 +373,7 @@ class CellClient(SessionClient):
         self.check_usable()
         if lock.phase is not Phase.HELD:
             self._ask_cause(lock)
-            raise not_committed(lock, FINISH_S, self.carrier.endpoint_of)
+            raise not_committed(lock, FINISH_S, self.carrier)
 
     def _check_open(self, lock: MultiLock) -> None:
         if self.forked or self.closed:
@@ -387,7 +387,7 @@ class CellClient(SessionClient):
         self._ask_cause(lock)
         self._ask_who(lock)
         name = name_of(lock.lock, writes)
-        return not_committed(lock, waited_s, self.carrier.endpoint_of, name=name)
+        return not_committed(lock, waited_s, self.carrier, name=name)
 
     def outcome(self, name: str, *, timeout_s: float) -> Position | None:
         """Ask for the outcome of a commit; see `Cell.outcome`."""
@@ -468,7 +468,7 @@ class CellClient(SessionClient):
             self.call_all(calls)
         if lock.phase is not Phase.HELD:
             self._ask_cause(lock)
-            raise not_committed(lock, FINISH_S, self.carrier.endpoint_of)
+            raise not_committed(lock, FINISH_S, self.carrier)
 
     def _ask_cause(self, lock: MultiLock) -> None:
         """Ask the shard why a lock ended whose loss a keep-alive has revealed."""

@@ -270,7 +270,7 @@ class SessionClient:
     def unreachable(self, shard: str, waited_s: float) -> ShardUnreachableError:
         """Return the error for a shard without an answer to a question that needs no disk."""
         runs = self.carrier.request(shard, Ping(), timeout_s=CALL_S / 4) is not None
-        return unreachable(shard, waited_s, self.carrier.endpoint_of, runs=runs)
+        return unreachable(shard, waited_s, self.carrier, runs=runs)
 
     def call_once(
         self, calls: Sequence[tuple[str, Request]], *, timeout_s: float = CALL_S

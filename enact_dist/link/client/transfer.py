@@ -300,7 +300,7 @@ class Transfer:
         """Wait a little before repeating slices, unless the transfer has to end."""
         silent_s = time.monotonic() - self._heard_s
         if silent_s >= self._client.request_timeout_s:
-            raise unreachable(shard, silent_s, self._client.carrier.endpoint_of)
+            raise unreachable(shard, silent_s, self._client.carrier)
         self._alive()
         self._client.rest(self._pause_s)
         self._pause_s = min(2 * self._pause_s, PAUSE_S_MAX)

@@ -12,15 +12,17 @@ from __future__ import annotations
 import gc
 import logging
 import secrets
+import signal
 import sys
 import threading
+import time
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.messages import ListLocks, Locks
-from enact_dist.core.protocol.records import Called, ShardReturned
+from enact_dist.core.protocol.records import Called, SessionSeen, ShardReturned
 from enact_dist.errors import ConfigError, EnactError, LinkError
 from enact_dist.link.client.calls import Calls
 from enact_dist.link.client.duplicate_daemons import (
@@ -30,6 +32,7 @@ from enact_dist.link.client.duplicate_daemons import (
     serving,
     two_daemons,
 )
+from enact_dist.link.daemon.key_watch import KeyWatch, checked_keys
 from enact_dist.link.daemon.service_manager import ServiceManager
 from enact_dist.link.daemon.shard_calls import ShardCalls
 from enact_dist.link.host import open_host
@@ -39,21 +42,29 @@ from enact_dist.link.signals import StopSignals
 from enact_dist.link.socket.service import SocketService
 from enact_dist.link.zenoh.config import close_session, listening_settings, open_session, to_reach
 from enact_dist.link.zenoh.discovery import FoundShard, find_shards
-from enact_dist.link.zenoh.endpoints import somebody_listens
+from enact_dist.link.zenoh.endpoints import somebody_listens, split_endpoint
 from enact_dist.link.zenoh.service import ZenohService
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
+
+    import zenoh
 
     from enact_dist.core.protocol.messages import Answer
     from enact_dist.core.shard.state import ShardSettings
     from enact_dist.link.daemon.metrics import MetricsServer
     from enact_dist.link.host import ShardHost
+    from enact_dist.link.zenoh.tls import Certificate, KeyFiles
 
 PROBE_S: Final = 0.3
 """How long another daemon with our name may take to answer before we start."""
 DRAIN_S: Final = 0.8
 """Default time for holders to finish; together with the rest it stays below 2 s."""
+RECONNECT_S: Final = 2.0
+"""How long clients may take to connect again when the shard has taken new keys."""
+REOPEN_S, REOPEN_PAUSE_S = 5.0, 0.02
+"""How long the port may take to be free for the shard's next Zenoh session."""
 SWITCH_INTERVAL_S: Final = 0.0002
 """With Python's 5 ms a busy store thread would add 7 to 11 ms to a call (p90), measured."""
 GC_THRESHOLDS: Final = (5_000, 20, 1_000_000)
@@ -81,6 +92,7 @@ class DaemonSettings:
         drain_s: How long holders may still take to finish after a signal.
         metrics: Host and port for Prometheus, see `link.daemon.metrics`; None: no server.
         written: The shard's endpoints in `cell.toml`, even if this start overrides them.
+        keys: The files by which the shard proves its name, in a cell with keys.
     """
 
     cell: str
@@ -94,6 +106,18 @@ class DaemonSettings:
     drain_s: float = DRAIN_S
     metrics: tuple[str, int] | None = None
     written: tuple[str, ...] = ()
+    keys: KeyFiles | None = None
+
+    @property
+    def hosts(self) -> tuple[str, ...]:
+        """Where it serves; every address of its host counts as the loopback."""
+        own = [
+            entry.endpoints
+            for entry in self.shard.placement.shards
+            if entry.name == self.shard.name
+        ]
+        places = map(to_reach, chain(self.listen, *own))
+        return tuple(dict.fromkeys(split_endpoint(place)[1].strip("[]") for place in places))
 
 
 class RunningShard:
@@ -104,6 +128,7 @@ class RunningShard:
         self._ended = threading.Event()
         self._stopping = threading.Lock()
         self._stopped = False
+        self._failure: Exception | None = None
         self._shared = _shared_folder(settings)
         shard = replace(settings.shard, start=secrets.randbits(62))
         if self._shared is not None:
@@ -127,11 +152,7 @@ class RunningShard:
             if settings.metrics is not None:
                 self._metrics = _metrics_server(settings, self.host)
                 undo.callback(self._metrics.close)
-            self._session = open_session(
-                listen=settings.listen,
-                lease_s=settings.link_lease_s,
-                more=listening_settings(settings.cell, shard.name),
-            )
+            self._session = self._open_session()
             undo.callback(close_session, self._session)
             self._calls = ShardCalls(
                 settings.cell,
@@ -140,20 +161,80 @@ class RunningShard:
                 lease_s=settings.link_lease_s,
                 answered=lambda *call: self.host.event(Called(*call)),
                 returned=lambda name: self.host.event(ShardReturned(name)),
+                keys=settings.keys,
             )
             undo.callback(self._calls.close)
-            self._comparing = Comparing(settings.cell, self.host.event)
+            self._comparing = Comparing(settings.cell, self.host.event, settings.keys)
             undo.callback(self._comparing.close)
             self.host.call_with(self._calls.submit, self._comparing.submit)
             self._service = ZenohService(self.host, self._session, settings.cell)
             for other in self._calls.others:  # the first tick's requests to them were not sent
                 self.host.event(ShardReturned(other))
+            undo.callback(self._service.close)
+            self.keys: KeyWatch | None = None
+            if settings.keys is not None:
+                certificate = checked_keys(settings.keys, ())
+                self.keys = KeyWatch(settings.keys, certificate, self._take_keys)
             undo.pop_all()
+
+    def _open_session(self) -> zenoh.Session:
+        settings = self.settings
+        return open_session(
+            listen=settings.listen,
+            lease_s=settings.link_lease_s,
+            keys=settings.keys,
+            more=listening_settings(settings.cell, settings.shard.name),
+        )
+
+    def _take_keys(self) -> Certificate:
+        """Serve with the key files as they are now; clients connect again, sessions and locks stay.
+
+        Raises:
+            EnactError: The files cannot be used; nothing has changed.
+        """
+        keys = self.settings.keys
+        assert keys is not None
+        with self._stopping:
+            certificate = checked_keys(keys, self.settings.hosts)
+            if self._stopped:
+                return certificate
+            before = self._service
+            before.close()
+            close_session(self._session)
+            try:
+                self._session = self._reopened()
+                self._service = ZenohService(self.host, self._session, self.settings.cell)
+            except Exception as error:
+                _log.critical("shard %s cannot listen again: %s", self.settings.shard.name, error)
+                self._failure = error
+                self._ended.set()
+                raise
+        grace_s = self.settings.link_lease_s + RECONNECT_S
+        timer = threading.Timer(grace_s, self._report_absent, (dict(before.present),))
+        timer.daemon = True
+        timer.start()
+        return certificate
+
+    def _reopened(self) -> zenoh.Session:
+        end_s = time.monotonic() + REOPEN_S
+        while True:
+            try:
+                return self._open_session()
+            except LinkError:  # the old socket is not closed yet
+                if time.monotonic() > end_s:
+                    raise
+                time.sleep(REOPEN_PAUSE_S)
+
+    def _report_absent(self, before: Mapping[str, str]) -> None:
+        """Report the tokens that have not come back: their clients ended during a reload."""
+        for session, identity in before.items():
+            if not self._stopped and session not in self._service.present:
+                self.host.event(SessionSeen(session, present=False, identity=identity))
 
     @property
     def failure(self) -> Exception | None:
         """Why the shard ended by itself, or None."""
-        return self.host.failure
+        return self.host.failure or self._failure
 
     def wait(self, timeout_s: float | None = None) -> bool:
         """Wait until the shard has failed or was asked to end; False after `timeout_s`."""
@@ -165,6 +246,8 @@ class RunningShard:
 
     def stop(self, *, drain_s: float = DRAIN_S) -> None:
         """Drain, answer parked requests, close connections and store; idempotent."""
+        if self.keys is not None:
+            self.keys.close()
         with self._stopping:
             if self._stopped:
                 return
@@ -245,10 +328,12 @@ def start_shard(settings: DaemonSettings) -> RunningShard:
     Raises:
         StoreError: The folder is in use, unreadable or corrupt.
         LinkError: An endpoint is in use, or another daemon already serves this shard.
-        ConfigError: An endpoint cannot be read, or is missing.
+        ConfigError: An endpoint cannot be read, or is missing, or the keys cannot be used.
     """
     if not settings.listen:
         raise ConfigError(f"shard {settings.shard.name} has no endpoint to listen at")
+    if settings.keys is not None:
+        checked_keys(settings.keys, settings.hosts)
     refuse_second_daemon(settings)
     return RunningShard(settings)
 
@@ -272,16 +357,17 @@ def refuse_second_daemon(settings: DaemonSettings, *, probe_s: float | None = No
     expected = {entry.name: entry.endpoints for entry in shards}
     ours = (*settings.listen, *expected.get(name, ()), *settings.written)
     listening = [place for place in dict.fromkeys(map(to_reach, ours)) if somebody_listens(place)]
-    found = find_shards(listening, timeout_s=probe_s) if listening else ()
+    keys = settings.keys
+    found = find_shards(listening, timeout_s=probe_s, keys=keys) if listening else ()
     if FoundShard(cell, name) in found:
         raise LinkError(
             f"shard {name} of cell {cell} already runs at {' or '.join(listening)}; two daemons"
             " must not serve one shard: stop the other, or give this one another name"
         )
     others = [entry for entry in shards if entry.name != name]
-    reported = expected_places(cell, others, timeout_s=probe_s) if others else ()
+    reported = expected_places(cell, others, timeout_s=probe_s, keys=keys) if others else ()
     for shard, places in moved_places(expected, chain.from_iterable(reported)).items():
-        daemons = serving(cell, shard, places, timeout_s=probe_s)
+        daemons = serving(cell, shard, places, timeout_s=probe_s, keys=keys)
         if shard == name and daemons:
             raise LinkError(
                 f"shard {name} of cell {cell} already runs at {daemons[0]}, where other shards of"
@@ -310,6 +396,8 @@ def run_shard(settings: DaemonSettings) -> int:
         try:
             signals.call(lambda word: _stop(shard, word, manager))
             signals.call_again(lambda _: shard.stop_now())
+            if shard.keys is not None:
+                signals.call_at(signal.SIGHUP, shard.keys.reload)
             shard.host.each_tick(lambda: manager.alive(shard.host.state))
             _say_ready(shard, formatter)
             manager.ready(shard.host.state)

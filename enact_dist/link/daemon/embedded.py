@@ -169,6 +169,10 @@ class EmbeddedCarrier:
             )
         return "this process"
 
+    def reason_away(self, shard: str) -> str:
+        """Return nothing: no certificate lies between the shard and its clients."""
+        return ""
+
     def close(self) -> None:
         """End the session's token and all feeds; idempotent."""
         if self._closed or self._pid != os.getpid():

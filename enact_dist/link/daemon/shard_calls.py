@@ -17,7 +17,14 @@ import zenoh
 from enact_dist.core.shard.owners import shard_identity
 from enact_dist.errors import ProtocolError
 from enact_dist.link.zenoh.config import close_session, keep_after_fork, open_session
-from enact_dist.link.zenoh.queries import ShardPresence, answer_in, next_reply, send_query
+from enact_dist.link.zenoh.queries import (
+    ServerNames,
+    ShardPresence,
+    answer_in,
+    next_reply,
+    send_query,
+)
+from enact_dist.link.zenoh.tls import why_refused
 from enact_dist.wire.keys import request_key, verb_of
 
 if TYPE_CHECKING:
@@ -25,6 +32,7 @@ if TYPE_CHECKING:
 
     from enact_dist.core.protocol.messages import Answer, Request, ShardEntry
     from enact_dist.link.zenoh.queries import Replies
+    from enact_dist.link.zenoh.tls import KeyFiles
 
 CALL_S: Final = 1.0
 """How long a call may stay without an answer; the core repeats it anyway."""
@@ -49,6 +57,10 @@ class ShardCalls:
         answered: Called with shard, request and answer, from the thread of that shard.
         returned: Called from any thread with the name of each previously called shard that comes
             (back) within reach.
+        keys: The files by which this shard proves its name, in a cell with keys.
+
+    Attributes:
+        keys: As given.
     """
 
     def __init__(
@@ -60,7 +72,9 @@ class ShardCalls:
         lease_s: float,
         answered: Callable[[str, Request, Answer], None],
         returned: Callable[[str], None],
+        keys: KeyFiles | None = None,
     ) -> None:
+        self.keys = keys
         self._cell, self._identity, self._lease_s = cell, shard_identity(name), lease_s
         self._endpoints = {shard.name: shard.endpoints for shard in shards if shard.name != name}
         self._answered, self._returned = answered, returned
@@ -142,6 +156,7 @@ class _Line:
         self._wake = threading.Condition(threading.Lock())
         self._ending = False
         self._session: zenoh.Session | None = None
+        self._names: ServerNames | None = None
         self._presence: ShardPresence | None = None
         self._silent_since_s: float | None = None
         self._silence_logged = False
@@ -178,7 +193,11 @@ class _Line:
         """
         session = self._session
         if session is None:
-            session = self._session = open_session(connect=self._endpoints, lease_s=self._lease_s)
+            files = self._calls.keys
+            session = self._session = open_session(
+                connect=self._endpoints, lease_s=self._lease_s, keys=files
+            )
+            self._names = ServerNames(session) if files is not None else None
         keys = [self._calls.key_of(self._shard, call) for call in calls]
         if self._presence is None:
             self._watch(session, keys[0])
@@ -187,8 +206,19 @@ class _Line:
             for call, key in zip(calls, keys, strict=True)
         ]
         end_s = time.monotonic() + CALL_S
-        received = [(call, _receive(self._shard, replies, end_s)) for call, replies in sent]
+        received = [(call, self._receive(replies, end_s)) for call, replies in sent]
         return [(request, answer) for request, answer in received if answer is not None]
+
+    def _receive(self, replies: Replies | None, end_s: float) -> Answer | None:
+        """Return the answer that came, or None; Zenoh itself ends the wait after `CALL_S`."""
+        if time.monotonic() > end_s + CALL_S:
+            return None
+        try:
+            sample = next_reply(replies, self._names, self._shard)
+            return answer_in(sample, self._shard) if sample is not None else None
+        except ProtocolError as error:
+            _log.warning("cannot read another shard's answer: %s", error)
+            return None
 
     def _watch(self, session: zenoh.Session, key: str) -> None:
         """Watch the shard; on failure the next calls try again, and these are made anyway."""
@@ -218,11 +248,13 @@ class _Line:
             and not self._ending
         ):
             self._silence_logged = True
+            refused = why_refused(self._endpoints, self._calls.keys, self._shard)
             _log.warning(
                 "shard %s at %s does not answer; commits over it and this shard wait for it, and"
-                " keep their locks here (enact lock ls)",
+                " keep their locks here (enact lock ls)%s",
                 self._shard,
                 " or ".join(self._endpoints),
+                f"; {refused}" if refused else "",
             )
 
     def _next_calls(self) -> list[Request] | None:
@@ -252,14 +284,3 @@ class _Line:
         session = self._session
         if session is not None:
             close_session(session)
-
-
-def _receive(shard: str, replies: Replies | None, end_s: float) -> Answer | None:
-    """Return the answer that came, or None; Zenoh itself ends the wait after `CALL_S`."""
-    if time.monotonic() > end_s + CALL_S or (sample := next_reply(replies)) is None:
-        return None
-    try:
-        return answer_in(sample, shard)
-    except ProtocolError as error:
-        _log.warning("cannot read another shard's answer: %s", error)
-        return None

@@ -310,6 +310,10 @@ class SocketCarrier:
         """Return the shard's expected endpoint, for messages to people."""
         return self._behind.endpoint_of(shard)
 
+    def reason_away(self, shard: str) -> str:
+        """Return why a shard's certificate or ours is refused; empty if that is not the reason."""
+        return self._behind.reason_away(shard)
+
     # ---------------------------------------------------------------- notices
 
     def subscribe(self, interest: Survey | None = None) -> NoticeQueue:

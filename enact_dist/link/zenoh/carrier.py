@@ -42,6 +42,7 @@ from enact_dist.link.zenoh.config import (
 )
 from enact_dist.link.zenoh.queries import (
     QUESTION,
+    ServerNames,
     ShardPresence,
     answer_in,
     bytes_of,
@@ -49,6 +50,7 @@ from enact_dist.link.zenoh.queries import (
     send_query,
     wait_connected,
 )
+from enact_dist.link.zenoh.tls import why_refused
 from enact_dist.wire.frames import decode_frame
 from enact_dist.wire.keys import ANY, notice_key, request_key, token_key, verb_of
 
@@ -58,6 +60,7 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.messages import Answer, Request, ShardEntry, Survey
     from enact_dist.link.carrier import Begun
     from enact_dist.link.zenoh.queries import Replies
+    from enact_dist.link.zenoh.tls import KeyFiles
 
 _log = logging.getLogger("enact.link")
 FETCH_BYTES: Final = 1 << 20
@@ -85,17 +88,26 @@ class _Link:
     Attributes:
         endpoints: Where it connects.
         session: Carries calls and the token.
+        names: Checks the names of the shards that answer, in a cell with keys.
     """
 
     def __init__(
-        self, endpoints: tuple[str, ...], token: str, lease_s: float, open_s: float
+        self,
+        endpoints: tuple[str, ...],
+        token: str,
+        lease_s: float,
+        open_s: float,
+        keys: KeyFiles | None,
     ) -> None:
         self.endpoints = endpoints
-        self._open = partial(open_session, connect=endpoints, lease_s=lease_s, open_s=open_s)
+        self._open = partial(
+            open_session, connect=endpoints, lease_s=lease_s, open_s=open_s, keys=keys
+        )
         self._mutex = threading.Lock()
         self._closed = False
         self._bulk: zenoh.Session | None = None
         self.session = self._open()
+        self.names = ServerNames(self.session) if keys is not None else None
         self._token = self.session.liveliness().declare_token(token)
         keep_after_fork(self)
 
@@ -168,10 +180,11 @@ class ZenohCarrier:
         ttl_s: The session's lease; a link counts as lost after half of it.
         connect_s: How long to wait for the first connection.
         open_s: How long a shard may take to answer a connection; closing waits for pending ones.
+        keys: The files by which this process proves its name, in a cell with keys.
 
     Raises:
         ShardUnreachableError: No endpoint could be connected.
-        ConfigError: An endpoint cannot be read.
+        ConfigError: An endpoint cannot be read, or the keys for one cannot be used.
         MisuseError: This process was forked from one that is connected.
     """
 
@@ -185,6 +198,7 @@ class ZenohCarrier:
         ttl_s: float,
         connect_s: float = CONNECT_S,
         open_s: float = OPEN_S,
+        keys: KeyFiles | None = None,
     ) -> None:
         self.inside = False
         self.fetch_bytes = FETCH_BYTES
@@ -193,6 +207,7 @@ class ZenohCarrier:
         self._identity = identity
         self._lease_s = ttl_s / 2
         self._open_s = open_s
+        self._keys = keys
         self._pid = os.getpid()
         self._closed = False
         self._mutex = threading.Lock()
@@ -208,9 +223,10 @@ class ZenohCarrier:
         first = self._open_link(tuple(endpoints))
         if not wait_connected(first.session, connect_s):
             self.close()
+            refused = why_refused(endpoints, keys)
             raise ShardUnreachableError(
-                f"no shard answers at {', '.join(endpoints)} (waited {connect_s:g} s); is the shard"
-                " running there? (enact shard run, enact doctor)",
+                f"no shard answers at {', '.join(endpoints)} (waited {connect_s:g} s); "
+                + (refused or "is the shard running there? (enact shard run, enact doctor)"),
                 endpoint=", ".join(endpoints),
             )
 
@@ -274,7 +290,7 @@ class ZenohCarrier:
         return request_key(self._cell, shard, verb_of(message), self._identity)
 
     def _receive(self, shard: str, replies: Replies | None) -> Answer | None:
-        sample = next_reply(replies)
+        sample = next_reply(replies, self._link_to(shard).names, shard)
         if replies is None or sample is None:
             return None
         self._unchecked.append(replies)
@@ -337,7 +353,7 @@ class ZenohCarrier:
 
     def _open_link(self, endpoints: tuple[str, ...]) -> _Link:
         token = token_key(self._cell, self._identity, self._session)
-        link = _Link(endpoints, token, self._lease_s, self._open_s)
+        link = _Link(endpoints, token, self._lease_s, self._open_s, self._keys)
         with self._mutex:
             late = self._closed  # closed by another thread while this link was opened
             if not late:
@@ -370,6 +386,11 @@ class ZenohCarrier:
         """Return the shard's expected endpoint, for messages to people."""
         endpoints = self._endpoints_of.get(shard) or self._links[0].endpoints
         return ", ".join(endpoints)
+
+    def reason_away(self, shard: str) -> str:
+        """Return why a shard's certificate or ours is refused; empty if that is not the reason."""
+        endpoints = self._endpoints_of.get(shard) or self._links[0].endpoints
+        return why_refused(endpoints, self._keys, shard)
 
     # ---------------------------------------------------------------- notices
 

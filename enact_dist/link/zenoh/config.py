@@ -46,6 +46,8 @@ from enact_dist.wire.limits import FRAME_BYTES_MAX
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from enact_dist.link.zenoh.tls import KeyFiles
+
 QUEUED_MAX: Final = 65_536
 """Messages in a channel between Zenoh and Python: Zenoh's thread must not wait for Python."""
 MESSAGE_BYTES_MAX: Final = FRAME_BYTES_MAX + (64 << 10)
@@ -84,6 +86,7 @@ def session_config(
     connect: Sequence[str] = (),
     lease_s: float,
     open_s: float = OPEN_S,
+    keys: KeyFiles | None = None,
     more: Mapping[str, object] = MappingProxyType({}),
 ) -> zenoh.Config:
     """Return the settings of a session.
@@ -93,10 +96,12 @@ def session_config(
         connect: Endpoints to connect to, and to reconnect to after each loss.
         lease_s: After this time without a sign of life from this process, a peer drops the link.
         open_s: How long a connected endpoint may take to answer in Zenoh's protocol.
+        keys: The files by which this process proves its name, for TLS endpoints.
         more: Further settings; those of a shard come from `listening_settings`.
 
     Raises:
-        ConfigError: Zenoh does not understand an endpoint.
+        ConfigError: Zenoh does not understand an endpoint, or the keys for one are missing or
+            cannot be used.
     """
     retry = {
         "period_init_ms": RETRY_MS,
@@ -124,6 +129,15 @@ def session_config(
         "transport/link/rx/max_message_size": MESSAGE_BYTES_MAX,
         **more,
     }
+    locked = [endpoint for endpoint in (*listen, *connect) if endpoint.startswith("tls/")]
+    if keys is not None:
+        keys.check()
+        settings["transport/link/tls"] = keys.settings(listens=bool(listen))
+    elif locked:
+        raise ConfigError(
+            f"{locked[0]} needs a key: name the cell.toml that has [security] keys, or the folder"
+            " in ENACT_KEYS (docs/security.md)"
+        )
     config = zenoh.Config()
     for key, value in settings.items():
         try:
@@ -194,18 +208,19 @@ def open_session(
     connect: Sequence[str] = (),
     lease_s: float,
     open_s: float = OPEN_S,
+    keys: KeyFiles | None = None,
     more: Mapping[str, object] = MappingProxyType({}),
 ) -> zenoh.Session:
     """Open a session; the caller closes it.
 
     Raises:
-        ConfigError: An endpoint cannot be read.
+        ConfigError: An endpoint cannot be read, or the keys for one cannot be used.
         LinkError: An endpoint to listen at is in use, or not of this host.
         MisuseError: This process was forked from one that has had a session.
     """
     check_not_forked()
     config = session_config(
-        listen=listen, connect=connect, lease_s=lease_s, open_s=open_s, more=more
+        listen=listen, connect=connect, lease_s=lease_s, open_s=open_s, keys=keys, more=more
     )
     _used_in.add(os.getpid())
     try:

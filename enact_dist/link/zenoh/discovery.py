@@ -19,10 +19,12 @@ from enact_dist.link.zenoh.endpoints import unknown_hosts
 from enact_dist.link.zenoh.queries import (
     POLL_S,
     QUESTION,
+    ServerNames,
     answer_in,
     send_query,
     wait_connected,
 )
+from enact_dist.link.zenoh.tls import why_refused
 from enact_dist.wire.keys import ANY, NAMELESS, identity_of, parse_request_key, request_key, verb_of
 
 if TYPE_CHECKING:
@@ -31,6 +33,8 @@ if TYPE_CHECKING:
     import zenoh
 
     from enact_dist.core.protocol.messages import Answer, Hello, Request
+    from enact_dist.link.zenoh.queries import Replies
+    from enact_dist.link.zenoh.tls import KeyFiles
 
 PROBE_LEASE_S: Final = 1.0
 """Link lease of the short sessions that only look for shards."""
@@ -46,32 +50,38 @@ class FoundShard:
     shard: str
 
 
-def find_shards(endpoints: Sequence[str], *, timeout_s: float) -> tuple[FoundShard, ...]:
+def find_shards(
+    endpoints: Sequence[str], *, timeout_s: float, keys: KeyFiles | None = None
+) -> tuple[FoundShard, ...]:
     """Return the shards that answer at one of `endpoints`; empty if none does.
 
     Raises:
-        ConfigError: An endpoint cannot be read.
+        ConfigError: An endpoint cannot be read, or the keys for one cannot be used.
+        ShardUnreachableError: A server with another name answers as a shard.
     """
     deadline_s = time.monotonic() + timeout_s
-    with _probe(endpoints, timeout_s) as session:
-        return _find(session, deadline_s)
+    with _probe(endpoints, timeout_s, keys) as probe:
+        return probe.find(deadline_s)
 
 
-def discover(endpoints: Sequence[str], hello: Hello, *, timeout_s: float) -> tuple[str, Welcome]:
+def discover(
+    endpoints: Sequence[str], hello: Hello, *, timeout_s: float, keys: KeyFiles | None = None
+) -> tuple[str, Welcome]:
     """Say hello to the first shard that answers; return its cell's name and its welcome.
 
     Raises:
-        ShardUnreachableError: None answered within `timeout_s`.
-        ConfigError: An endpoint cannot be read.
+        ShardUnreachableError: None answered within `timeout_s`; the message says so if a
+            certificate was refused.
+        ConfigError: An endpoint cannot be read, or the keys for one cannot be used.
         ProtocolError: An answer cannot be read, or does not answer a hello.
     """
     deadline_s = time.monotonic() + timeout_s
     silent = ""
-    with _probe(endpoints, timeout_s) as session:
+    with _probe(endpoints, timeout_s, keys) as probe:
         while time.monotonic() < deadline_s:
-            for found in _find(session, deadline_s):
+            for found in probe.find(deadline_s):
                 silent = found.shard
-                answer = _greet(session, found, hello, deadline_s)
+                answer = probe.greet(found, hello, deadline_s)
                 if isinstance(answer, Welcome):
                     return found.cell, answer
                 if answer is not None:
@@ -85,31 +95,38 @@ def discover(endpoints: Sequence[str], hello: Hello, *, timeout_s: float) -> tup
             endpoint=where,
         )
     unknown = ", ".join(unknown_hosts(endpoints))
+    refused = why_refused(endpoints, keys)
     raise ShardUnreachableError(
         f"no shard answers at {where} (waited {timeout_s:g} s);"
         + (f" the host name {unknown} cannot be resolved;" if unknown else "")
-        + " is one running there? (enact shard run, enact doctor)",
+        + (f" {refused}" if refused else " is one running there? (enact shard run, enact doctor)"),
         endpoint=where,
     )
 
 
 def ask_shards(
-    endpoints: Sequence[str], shards: Sequence[FoundShard], message: Request, *, timeout_s: float
+    endpoints: Sequence[str],
+    shards: Sequence[FoundShard],
+    message: Request,
+    *,
+    timeout_s: float,
+    keys: KeyFiles | None = None,
 ) -> dict[FoundShard, Answer]:
     """Send one request to each of `shards`; return the answers that come in time.
 
     Raises:
-        ConfigError: An endpoint cannot be read.
+        ConfigError: An endpoint cannot be read, or the keys for one cannot be used.
+        ShardUnreachableError: A server with another name answers as a shard.
         ProtocolError: An answer cannot be read.
     """
     deadline_s = time.monotonic() + timeout_s
     answers: dict[FoundShard, Answer] = {}
-    with _probe(endpoints, timeout_s) as session:
+    with _probe(endpoints, timeout_s, keys) as probe:
         while (left_s := deadline_s - time.monotonic()) > 0 and len(answers) < len(shards):
             # A hung shard must leave the others time for a second query after they connect.
             wait_s = max(SHORTEST_S, left_s / 2)
             asked = [
-                (shard, _replies(session, _key(shard, message), message, wait_s))
+                (shard, probe.replies(_key(shard, message), message, wait_s))
                 for shard in shards
                 if shard not in answers
             ]
@@ -122,45 +139,53 @@ def ask_shards(
 
 
 @contextmanager
-def _probe(endpoints: Sequence[str], timeout_s: float) -> Iterator[zenoh.Session]:
+def _probe(endpoints: Sequence[str], timeout_s: float, keys: KeyFiles | None) -> Iterator[_Probe]:
     """Open a short session that only looks for shards."""
-    session = open_session(connect=endpoints, lease_s=PROBE_LEASE_S, open_s=timeout_s)
+    session = open_session(connect=endpoints, lease_s=PROBE_LEASE_S, open_s=timeout_s, keys=keys)
     try:
-        yield session
+        yield _Probe(session, ServerNames(session) if keys is not None else None)
     finally:
         close_session(session)
 
 
+@dataclass(frozen=True, slots=True)
+class _Probe:
+    """A short session, and what checks the names of those that answer on it."""
+
+    session: zenoh.Session
+    names: ServerNames | None
+
+    def find(self, deadline_s: float) -> tuple[FoundShard, ...]:
+        """Query until a shard has answered or time is up."""
+        if not wait_connected(self.session, deadline_s - time.monotonic()):
+            return ()
+        key = request_key(ANY, ANY, verb_of(QUESTION), NAMELESS)
+        while (left_s := deadline_s - time.monotonic()) > 0:
+            found = self.replies(key, QUESTION, left_s)
+            keys = [str(sample.key_expr) for sample in found]
+            if keys:
+                return tuple({FoundShard(*parse_request_key(key)[:2]): None for key in keys})
+            time.sleep(POLL_S)  # connected, but the peer's queryables are not known yet
+        return ()
+
+    def greet(self, found: FoundShard, hello: Hello, deadline_s: float) -> Answer | None:
+        """Say hello to a shard; return its answer."""
+        key = _key(found, hello, identity_of(hello.actor, hello.host, hello.pid))
+        wait_s = max(SHORTEST_S, deadline_s - time.monotonic())
+        sample = next(self.replies(key, hello, wait_s), None)
+        return answer_in(sample, found.shard) if sample is not None else None
+
+    def replies(self, key: str, message: Request, timeout_s: float) -> Iterator[zenoh.Sample]:
+        """Send a query now; return an iterator that waits for its replies."""
+        return self._checked(send_query(self.session, key, message, timeout_s=timeout_s))
+
+    def _checked(self, replies: Replies | None) -> Iterator[zenoh.Sample]:
+        for reply in replies or ():
+            if reply.ok is not None:
+                if self.names is not None:
+                    self.names.check(reply, parse_request_key(str(reply.ok.key_expr))[1])
+                yield reply.ok
+
+
 def _key(shard: FoundShard, message: Request, identity: str = NAMELESS) -> str:
     return request_key(shard.cell, shard.shard, verb_of(message), identity)
-
-
-def _find(session: zenoh.Session, deadline_s: float) -> tuple[FoundShard, ...]:
-    """Query until a shard has answered or time is up."""
-    if not wait_connected(session, deadline_s - time.monotonic()):
-        return ()
-    key = request_key(ANY, ANY, verb_of(QUESTION), NAMELESS)
-    while (left_s := deadline_s - time.monotonic()) > 0:
-        found = _replies(session, key, QUESTION, left_s)
-        keys = [str(sample.key_expr) for sample in found]
-        if keys:
-            return tuple({FoundShard(*parse_request_key(key)[:2]): None for key in keys})
-        time.sleep(POLL_S)  # connected, but the peer's queryables are not known yet
-    return ()
-
-
-def _greet(
-    session: zenoh.Session, found: FoundShard, hello: Hello, deadline_s: float
-) -> Answer | None:
-    key = _key(found, hello, identity_of(hello.actor, hello.host, hello.pid))
-    wait_s = max(SHORTEST_S, deadline_s - time.monotonic())
-    sample = next(_replies(session, key, hello, wait_s), None)
-    return answer_in(sample, found.shard) if sample is not None else None
-
-
-def _replies(
-    session: zenoh.Session, key: str, message: Request, timeout_s: float
-) -> Iterator[zenoh.Sample]:
-    """Send a query now; return an iterator that waits for its replies."""
-    replies = send_query(session, key, message, timeout_s=timeout_s)
-    return (reply.ok for reply in replies or () if reply.ok is not None)

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 PROTOCOLS: Final = frozenset(("tcp", "udp", "tls", "quic", "ws", "unixsock-stream"))
 """Prefixes of endpoints."""
+STREAMS: Final = frozenset(("tcp", "tls"))
+"""Those whose connections are ordinary TCP sockets."""
 LISTENS_S: Final = 0.3
 """How long a host may take to accept or refuse a probing connection."""
 LOOK_UP_S: Final = 1.0
@@ -36,7 +38,7 @@ def split_endpoint(endpoint: str) -> tuple[str, str, str]:
 def somebody_listens(endpoint: str) -> bool:
     """Return whether asking there is worthwhile; a refused connection saves the wait."""
     protocol, host, port = split_endpoint(endpoint)
-    if protocol != "tcp" or not port.isdecimal():
+    if protocol not in STREAMS or not port.isdecimal():
         return True
     try:
         socket.create_connection((host.strip("[]"), int(port)), LISTENS_S).close()
@@ -48,7 +50,7 @@ def somebody_listens(endpoint: str) -> bool:
 def is_of_this_host(endpoint: str) -> bool:
     """Return whether this host may listen at an endpoint; True if that cannot be determined."""
     protocol, host, port = split_endpoint(endpoint)
-    if protocol != "tcp" or not port.isdecimal():
+    if protocol not in STREAMS or not port.isdecimal():
         return True
     try:
         found = socket.getaddrinfo(host.strip("[]"), 0, type=socket.SOCK_STREAM)

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Final
 
 import zenoh
 
-from enact_dist.link.zenoh.endpoints import split_endpoint
+from enact_dist.link.zenoh.endpoints import STREAMS, split_endpoint
 from enact_dist.link.zenoh.events import Events
 
 if TYPE_CHECKING:
@@ -373,7 +373,7 @@ def _hosts_of(watches: Iterable[LinkWatch]) -> set[Host]:
     hosts = set()
     for endpoint in {endpoint for watch in watches for endpoint in watch.lost}:
         protocol, host, _ = split_endpoint(endpoint)
-        if protocol == "tcp" and _is_elsewhere(host):
+        if protocol in STREAMS and _is_elsewhere(host):
             hosts.add((host, _port_of(endpoint)))
     return hosts
 

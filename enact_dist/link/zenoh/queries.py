@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Final, cast
 import zenoh
 
 from enact_dist.core.protocol.messages import Commit, Ping, Prepare
+from enact_dist.core.shard.owners import shard_identity
+from enact_dist.errors import ShardUnreachableError
 from enact_dist.link.zenoh.config import keep_after_fork
 from enact_dist.link.zenoh.events import Events
 from enact_dist.wire.frames import decode_answer, encode_frame
@@ -78,14 +80,63 @@ def send_query(
         return None
 
 
-def next_reply(replies: Replies | None) -> zenoh.Sample | None:
-    """Wait for a reply; return None if the query ended without one, or timed out."""
+def next_reply(
+    replies: Replies | None, names: ServerNames | None = None, shard: str = ""
+) -> zenoh.Sample | None:
+    """Wait for a reply; return None if the query ended without one, or timed out.
+
+    Args:
+        replies: Of the query.
+        names: Checks that the reply is that of `shard`, in a cell with keys.
+        shard: The shard that was asked.
+
+    Raises:
+        ShardUnreachableError: The reply comes from a server with another name.
+    """
     if replies is None:
         return None
     try:
-        return replies.recv().ok
+        reply = replies.recv()
     except zenoh.ZError:
         return None
+    if names is not None:
+        names.check(reply, shard)
+    return reply.ok
+
+
+class ServerNames:
+    """Checks by certificates that answers on a session come from the shards that were asked.
+
+    Every key of a cell may connect, so a shard's certificate must prove that shard's name, too.
+    Each server is looked up once: the check of a further answer takes 1 us.
+    """
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._session = session
+        self._known: set[tuple[zenoh.ZenohId, str]] = set()
+
+    def check(self, reply: zenoh.Reply, shard: str) -> None:
+        """Check who has answered.
+
+        Raises:
+            ShardUnreachableError: The certificate of that server proves another name.
+        """
+        replier = reply.replier_id
+        if replier is None or (replier.zid, shard) in self._known:
+            return
+        for link in self._session.info.links():
+            if link.zid != replier.zid:
+                continue
+            expected, found = shard_identity(shard), link.auth_identifier
+            if found != expected:
+                raise ShardUnreachableError(
+                    f"shard {shard} is out of reach: what answers in its name at {link.dst} has the"
+                    f" certificate of {found}, not of {expected}; stop it, or correct the endpoints"
+                    " in cell.toml",
+                    shard=shard,
+                    endpoint=str(link.dst),
+                )
+            self._known.add((replier.zid, shard))
 
 
 def answer_in(sample: zenoh.Sample, shard: str) -> Answer:

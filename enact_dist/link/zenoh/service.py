@@ -81,6 +81,7 @@ class ZenohService:
     Attributes:
         senders: Sends the answers.
         count: Adds to a counter of the shard.
+        present: The sessions whose tokens are there, each with its identity.
     """
 
     def __init__(self, host: ShardHost, session: zenoh.Session, cell: str) -> None:
@@ -89,6 +90,7 @@ class ZenohService:
         self.count = host.count
         self.senders = Senders(host.count)
         self._closed = False
+        self.present: dict[str, str] = {}
         keep_after_fork(self)
         recycle_blocks()
         self._publisher = session.declare_publisher(
@@ -111,7 +113,7 @@ class ZenohService:
         self._drained: threading.Event | None = None
         self._marked: threading.Event | None = None
         self._mark = self._left = 0
-        host.add_inbox(self.drain_inbox)
+        self._remove_inbox = host.add_inbox(self.drain_inbox)
         self._staged: queue.SimpleQueue[tuple[Stage, _Call, str] | None] = queue.SimpleQueue()
         self._staged_mutex = threading.Lock()
         self._staged_bytes = 0
@@ -308,6 +310,10 @@ class ZenohService:
                 identity, session = token_of(str(sample.key_expr))
                 if session:
                     present = sample.kind == zenoh.SampleKind.PUT
+                    if present:
+                        self.present[session] = identity
+                    else:
+                        self.present.pop(session, None)
                     self._host.event(SessionSeen(session, present, identity))
         except zenoh.ZError:
             return
@@ -318,6 +324,7 @@ class ZenohService:
             return
         self._closed = True
         self._unwatch()
+        self._remove_inbox()
         self._queryable.undeclare()  # type: ignore[no-untyped-call]  # untyped in its stub
         self._tokens.undeclare()  # type: ignore[no-untyped-call]  # untyped in its stub
         self.senders.close()

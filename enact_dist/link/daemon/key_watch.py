@@ -1,0 +1,127 @@
+"""Keeps a running shard's certificate up to date: when asked, and by itself near its end.
+
+Zenoh reads the files of a listener only when it opens.  So new files are taken by closing and
+opening the shard's Zenoh session, for which its clients wait 60 ms; sessions and locks stay.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.errors import ConfigError, EnactError
+from enact_dist.link.zenoh.tls import day_of, hosts_missing, own_certificate
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from enact_dist.link.zenoh.tls import Certificate, KeyFiles
+
+LAST_PART: Final = 0.1
+"""In the last tenth of its life a certificate is replaced as soon as there is a newer file."""
+LOOKS: Final = 500
+"""Looks for a newer file in the life of a certificate."""
+LOOK_S_MIN, LOOK_S_MAX = 0.2, 60.0
+JOIN_S: Final = 1.0
+
+_log = logging.getLogger("enact.shard")
+
+
+def checked_keys(keys: KeyFiles, hosts: Iterable[str]) -> Certificate:
+    """Return the certificate of a shard if others will accept it now.
+
+    Args:
+        keys: Its files.
+        hosts: Where it serves; one that the certificate does not name is only logged.
+
+    Raises:
+        ConfigError: They will not accept it; the message names the file.
+    """
+    certificate = own_certificate(keys)
+    problem = certificate.problem(time.time())
+    if problem:
+        raise ConfigError(f"{keys.certificate} {problem}", path=str(keys.certificate))
+    if missing := hosts_missing(certificate, hosts):
+        _log.warning(
+            "%s is not for %s: no client can connect to that endpoint of this shard; renew it:"
+            " enact cell keys renew %s",
+            keys.certificate,
+            ", ".join(missing),
+            keys.name,
+            extra={"event": "shard.keys"},
+        )
+    return certificate
+
+
+class KeyWatch:
+    """Lets a shard take new files.
+
+    Args:
+        keys: The shard's files.
+        certificate: What it serves with now.
+        reopen: Takes the files as they are and returns the new certificate; raises `EnactError` and
+            keeps the old one if they cannot be used.
+    """
+
+    def __init__(
+        self, keys: KeyFiles, certificate: Certificate, reopen: Callable[[], Certificate]
+    ) -> None:
+        self._keys, self._reopen = keys, reopen
+        self._certificate = certificate
+        self._taken_ns = self._changed_ns()
+        self._ended = threading.Event()
+        self._mutex = threading.Lock()
+        self._thread = threading.Thread(target=self._run, name="enact-keys", daemon=True)
+        self._thread.start()
+
+    def reload(self) -> bool:
+        """Take the files as they are; return whether that worked, and log it."""
+        with self._mutex:
+            self._taken_ns = self._changed_ns()
+            began_s = time.monotonic()
+            try:
+                self._certificate = self._reopen()
+            except EnactError as error:
+                _log.error(
+                    "keys not reloaded, so the old ones stay: %s",
+                    error,
+                    extra={"event": "shard.keys_refused"},
+                )
+                return False
+            _log.info(
+                "keys reloaded in %.0f ms; the certificate is valid until %s",
+                (time.monotonic() - began_s) * 1e3,
+                day_of(self._certificate.ends_s),
+                extra={"event": "shard.keys"},
+            )
+            return True
+
+    def _run(self) -> None:
+        while not self._ended.wait(self._pause_s()):
+            if self._is_due():
+                self.reload()
+
+    def _pause_s(self) -> float:
+        life_s = self._certificate.ends_s - self._certificate.starts_s
+        return min(LOOK_S_MAX, max(LOOK_S_MIN, life_s / LOOKS))
+
+    def _is_due(self) -> bool:
+        """Return whether the certificate ends soon and there is a file that was not tried."""
+        now = self._certificate
+        left_s = now.ends_s - time.time()
+        ends_soon = left_s < LAST_PART * (now.ends_s - now.starts_s)
+        return ends_soon and self._changed_ns() > self._taken_ns
+
+    def _changed_ns(self) -> int:
+        """Return when the certificate's file was last changed; 0 if that cannot be read."""
+        try:
+            return self._keys.certificate.stat().st_mtime_ns
+        except OSError:
+            return 0
+
+    def close(self) -> None:
+        """Look no more; idempotent."""
+        self._ended.set()
+        self._thread.join(JOIN_S)
