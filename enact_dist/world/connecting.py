@@ -124,7 +124,7 @@ def local(
     from enact_dist.core.shard.state import ShardSettings
     from enact_dist.link.client.locks import CellClient
     from enact_dist.link.daemon.embedded import EmbeddedCarrier
-    from enact_dist.link.host import open_host
+    from enact_dist.link.opening import open_host
 
     names = dict.fromkeys((*_world_names(worlds), *(config.worlds if config else ())))
     settings = ShardSettings(
