@@ -19,6 +19,7 @@ import pytest
 from enact_dist.cli.main import build_parser
 from enact_dist.config.environment import variable_of, variables_of
 from enact_dist.config.read import load_config
+from enact_dist.config.rights import AllowTable, RightsConfig, SecurityConfig
 from enact_dist.config.table import keys_of
 from enact_dist.config.types import (
     ActorConfig,
@@ -51,7 +52,7 @@ _BLOCK = re.compile(
     re.DOTALL | re.MULTILINE,
 )
 _NAMED = re.compile(r"`(?:\.\./)*(\w+(?:[./]\w+)+)`")
-OBJECTS = {"actor", "actors", "shard", "world", "zenoh"}
+OBJECTS = {"actor", "actors", "rights", "shard", "world", "zenoh"}
 """Folders whose names stand for an object, event or file, too: `world.view`, `shard.ready`."""
 
 
@@ -281,9 +282,20 @@ def test_page_of_cell_toml_has_every_key_and_no_other():
     page = (ROOT / "enact_dist" / "docs" / "cell.md").read_text("utf-8")
     tables = re.findall(r"^\| key .*\n\|---.*\n((?:\|.*\n)+)", page, re.MULTILINE)
     explained = [set(re.findall(r"^\| `(\w+)` \|", rows, re.MULTILINE)) for rows in tables]
-    kinds = (CellConfig, ShardConfig, PinTable, AspectConfig, RetentionTable, ActorConfig)
+    kinds = (
+        CellConfig, ShardConfig, PinTable, AspectConfig, RetentionTable, ActorConfig,
+        SecurityConfig, RightsConfig, AllowTable,
+    )  # fmt: skip
     accepted = [set(keys_of(kind)) for kind in kinds]
-    lists = {"shards", "pins", "aspects", "actors"}  # headings of the page
+    lists = {
+        "shards",
+        "pins",
+        "aspects",
+        "actors",
+        "security",
+        "rights",
+        "allow",
+    }  # headings of the page
     assert sorted(map(sorted, explained)) == sorted(sorted(keys - lists) for keys in accepted)
 
     variables = set(re.findall(r"^\| `(ENACT_\w+)` \|", page, re.MULTILINE))

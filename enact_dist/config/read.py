@@ -48,6 +48,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.config.environment import with_environment
 from enact_dist.config.lines import LineLocator
+from enact_dist.config.rights_check import check_rights, refuse_open_doors
 from enact_dist.config.table import ConfigSource, Table, suggestion
 from enact_dist.config.types import ActorProcess, CellConfig, ShardConfig, is_wildcard
 from enact_dist.errors import ConfigError
@@ -109,7 +110,9 @@ def parse_config(
         raise ConfigError(f"{shown}, line {line}: {error}", path=shown, line=line) from error
     root = Table(values, (), ConfigSource(shown, LineLocator(text), file.parent))
     config = _cell(root, file)
-    return with_environment(config, os.environ if environment is None else environment)
+    config = with_environment(config, os.environ if environment is None else environment)
+    refuse_open_doors(root, config)
+    return config
 
 
 def _cell(root: Table, file: Path) -> CellConfig:
@@ -128,6 +131,7 @@ def _cell(root: Table, file: Path) -> CellConfig:
             problem = f"the world context {world!r} is listed twice"
             root.source.refuse(("worlds", index), problem)
     _check_actors(root, config)
+    check_rights(root, config)
     return replace(config, shards=shards)
 
 

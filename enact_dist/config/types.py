@@ -15,6 +15,13 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, NamedTuple
 
+from enact_dist.config.rights import (
+    RightsConfig,
+    SecurityConfig,
+    compiled_rights,
+    is_rights,
+    is_security,
+)
 from enact_dist.config.shows import GUESSED, Shows
 from enact_dist.config.table import TableKey
 from enact_dist.core.protocol.messages import AspectEntry, Pin, PlacementMap, ShardEntry
@@ -255,6 +262,8 @@ class CellConfig:
         pins: Entities kept on one shard; the first pin that matches wins.
         aspects: Aspects whose durability is fixed here.
         actors: Actors of the cell, in the order of the file.
+        security: Who has every right.
+        rights: Who may do what; None: every client may do everything.
     """
 
     path: Annotated[Path, TableKey(given=True)]
@@ -272,6 +281,20 @@ class CellConfig:
     pins: Annotated[tuple[Pin, ...], TableKey(table=PinTable, make=Pin._make)] = ()
     aspects: tuple[AspectConfig, ...] = ()
     actors: tuple[ActorConfig, ...] = ()
+    security: Annotated[SecurityConfig | None, TableKey(table=SecurityConfig, make=is_security)] = (
+        None
+    )
+    rights: Annotated[RightsConfig | None, TableKey(table=RightsConfig, make=is_rights)] = None
+
+    @property
+    def actor_names(self) -> tuple[str, ...]:
+        """Names of its actors."""
+        return tuple(actor.name for actor in self.actors)
+
+    @property
+    def operators(self) -> tuple[str, ...]:
+        """Who has every right."""
+        return self.security.operators if self.security is not None else ()
 
     @property
     def ttl_ns(self) -> int:
@@ -317,16 +340,22 @@ class CellConfig:
         """Return what the core of shard `name` has to know.
 
         Raises:
-            ConfigError: The cell has none of that name.
+            ConfigError: The cell has none of that name, or its `rights.toml` is missing.
         """
         from enact_dist.core.shard.state import ShardSettings
 
+        rights = self.rights
         return ShardSettings(
             name=self.shard(name).name,
             placement=self.placement_map(),
             worlds=self.worlds,
             aspects=self.aspect_entries(),
             ttl_ns_max=self.ttl_ns,
+            rights=None
+            if rights is None
+            else compiled_rights(
+                rights, self.path, actors=self.actor_names, operators=self.operators
+            ),
         )
 
 
