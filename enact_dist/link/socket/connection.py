@@ -59,6 +59,7 @@ class SocketConnection:
     Attributes:
         session: The session it speaks for; empty until the service has admitted it.
         identity: Owner of that session.
+        subject: Whose rights it uses; None: the shard has no rights.
         peer: The process at the other end, according to the kernel.
         step: 3n while it waits for its n-th request, 3n + 1 once it has read it, 3n + 2 once the
             host has it.
@@ -67,7 +68,7 @@ class SocketConnection:
 
     __slots__ = (
         "_answer", "_answered", "_late", "_rest", "_service", "_stream", "_thread", "connected",
-        "ended", "identity", "peer", "session", "step",
+        "ended", "identity", "peer", "session", "step", "subject",
     )  # fmt: skip
 
     def __init__(self, service: Admission, connected: socket.socket) -> None:
@@ -80,6 +81,7 @@ class SocketConnection:
         self._rest: memoryview | None = None
         self.connected = connected
         self.session = self.identity = ""
+        self.subject: str | None = None
         self.peer = PeerCredentials(0, 0, 0)
         self.step = 2
         self.ended = threading.Event()
@@ -161,7 +163,7 @@ class SocketConnection:
                 self.step = step = step + 1
                 self._send(not_yours(session, "another connection", self.identity))
                 continue
-            host.submit(message, self._take, self.identity)
+            host.submit(message, self._take, self.identity, self.subject)
             self.step = step = step + 1
             answer, self._answer = self._answer, None
             if answer is not None:
