@@ -7,7 +7,7 @@ from contextlib import contextmanager
 import pytest
 from ports import free_endpoint
 
-from enact_dist import Aspect, Durability, Entity, Lock, View, Write, connect
+from enact_dist import Aspect, Durability, Entities, Entity, Lock, View, Write, connect
 from enact_dist.config.read import load_config
 from enact_dist.errors import LinkError, PermissionDeniedError
 from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
@@ -98,6 +98,25 @@ def test_a_name_over_zenoh_is_no_proof(tmp_path, monkeypatch):
             pytest.raises(LinkError, match="over Zenoh, where its name is only its own word"),
         ):
             put(ada, "view/1", 1)
+
+
+def test_a_watch_over_the_socket_leaves_out_what_is_not_readable(tmp_path):
+    """Also where a commit changes both; the numbers of its notices have no gap."""
+    with (
+        guarded(tmp_path) as (_, file),
+        connect(file, actor="camera") as camera,
+        connect(file, actor="ada") as ada,
+        camera.world("online").watch(Entities("**"), COUNT) as watch,
+    ):
+        put(ada, "secret", 1)
+        both = [Write(ada.world("online"), Entity(name), COUNT) for name in ("secret", "view/1")]
+        with Lock(*both) as lock:
+            for request in both:
+                lock[request] = 2
+        put(ada, "view/1", 3)
+        changes = [watch.next(5.0) for _ in range(2)]
+        assert {change.entity.name for change in changes} == {"view/1"}
+        assert watch.next(0.2) is None
 
 
 def test_a_user_without_an_entry_is_refused_by_number(tmp_path):

@@ -10,9 +10,10 @@ from __future__ import annotations
 import logging
 import socket
 import threading
-from typing import Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
 from enact_dist.core.protocol.messages import Answer, Outcome, Refused, Release, Request, Survey
+from enact_dist.core.rights.rules import UNPROVEN, path_of
 from enact_dist.core.shard.owners import SESSION_OF, not_yours
 from enact_dist.errors import LinkError, ProtocolError
 from enact_dist.link.answers import encoded, size_of
@@ -31,6 +32,9 @@ from enact_dist.link.socket.peers import PeerCredentials
 from enact_dist.link.socket.watcher import Publisher, SocketWatcher
 from enact_dist.patterns import checked_patterns
 from enact_dist.wire.frames import decode_frame, decode_request
+
+if TYPE_CHECKING:
+    from enact_dist.core.protocol.datum import Slot
 
 OPEN_S: Final = 1.0
 """How long a new connection may take to name its session."""
@@ -147,7 +151,9 @@ class SocketConnection:
             if kind != FrameKind.MESSAGE:
                 if kind == FrameKind.WATCH:
                     self.step = step + 1
-                    SocketWatcher(self._service, self.connected, _interest(header)).run()
+                    may_read = self._may_read if host.rights is not None else None
+                    interest = _interest(header)
+                    SocketWatcher(self._service, self.connected, interest, may_read).run()
                     return
                 raise ProtocolError(f"a frame of kind {kind} came instead of a request")
             try:
@@ -170,6 +176,10 @@ class SocketConnection:
                 self._send(answer)
             else:
                 self._send_late()
+
+    def _may_read(self, slot: Slot) -> bool:
+        rights = self._service.host.rights
+        return rights is None or rights.may(self.subject or UNPROVEN, "read", path_of(slot))
 
     def _may_name(self, session: str, message: Request) -> bool:
         """Whether a message may name another session, as a question for a commit's outcome does.
