@@ -11,7 +11,7 @@
     │  ├─ DatumTypeError       a datum that is not of its aspect's type
     │  ├─ UnknownWorldError    a world context that the cell does not have     .known
     │  └─ ConfigError          a cell.toml, folder or option that cannot be used   .line
-    ├─ PermissionDeniedError   not allowed: another's session, a shard's message
+    ├─ PermissionDeniedError   not allowed: no right, or another's session    .identity .right
     ├─ NullDatumError          the world context does not know this datum      .reason
     ├─ ForgottenError          a past state that has left its retention        .oldest_ns
     ├─ ChangedError            an expected view moved on; nothing written
@@ -91,10 +91,35 @@ class ConfigError(MisuseError):
 
 
 class PermissionDeniedError(EnactError):
-    """The caller may not do that; the message names the caller and the owner.
+    """The caller may not do that; the message names the caller and what it lacks.
 
-    Repeating the request does not help, so an actor that gets this error ends at once.
+    Repeating the request does not help, so an actor that gets this error ends at once.  The
+    attributes are empty where another client's session was named, or where they do not apply.
+
+    Attributes:
+        identity: Whose right is missing.
+        right: Which one: "read", "write", "change", "init", "delete", "fork", …
+        world: The world context of the slot.
+        entity: Its entity, or the requested pattern.
+        aspect: Its aspect.
+        rule: Where a rule would give it, such as "cell.toml, line 41".
     """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        identity: str = "",
+        right: str = "",
+        world: str = "",
+        entity: str = "",
+        aspect: str = "",
+        rule: str = "",
+    ) -> None:
+        super().__init__(message)
+        self.identity, self.right = identity, right
+        self.world, self.entity, self.aspect = world, entity, aspect
+        self.rule = rule
 
 
 class NullDatumError(EnactError):

@@ -8,6 +8,11 @@ both questions cost time in proportion to the lengths, whatever the pattern says
     group): the leftmost place leaves the most for the rest, so a later one cannot help.  The same
     holds for ``**`` and the segments behind it.
   * Overlap fills a table of the segments of both patterns, each pair once.
+
+Whether one pattern contains another is the same question as whether it matches the other's text: a
+star of the inner one is a character that only a star can match, and its ``**`` a segment that only
+``**`` can match (`contained`).  The answer may be no for one that does contain the other, such as
+``*/**`` for ``**/a``; it is never wrongly yes.
 """
 
 from __future__ import annotations
@@ -17,7 +22,7 @@ from itertools import groupby
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
 
 LENGTH_MAX: Final = 200
 """Longest pattern, as long as the longest name."""
@@ -29,6 +34,8 @@ DEEP_MAX: Final = 4
 PATTERNS_MAX: Final = 256
 """Most patterns with stars in one lock, view or listing."""
 
+_DEEP: Final = "\0"
+"""Stands for ``**`` in the text of a pattern: no name and no other pattern has this character."""
 _SEGMENT = re.compile(r"(?:\*\*|(?!.*\*\*)[A-Za-z0-9_*][A-Za-z0-9_.\-*]*)\Z")
 _compiled: dict[str, re.Pattern[str]] = {}
 _COMPILED_MAX: Final = 4096
@@ -132,6 +139,24 @@ def patterns_overlap(one: str, other: str) -> bool:
     return after[0]
 
 
+def pattern_contains(outer: str, inner: str) -> bool:
+    """Say whether `outer` covers all names that `inner` covers; never wrongly yes."""
+    return container(outer)(contained(inner)) is not None
+
+
+def container(pattern: str) -> Callable[[str], object]:
+    """Return a function of what `contained` returns; it returns None for what is not contained."""
+    return re.compile(_source(pattern)).match
+
+
+def contained(pattern: str) -> str:
+    """Return a pattern, or a name, as the text that the pattern around it has to match."""
+    if "**" not in pattern:
+        return f"{pattern}/"
+    segments = [_DEEP if segment == "**" else segment for segment in pattern.split("/")]
+    return f"{'/'.join(segments)}/"
+
+
 def _segments_overlap(one: str, other: str) -> bool:
     """Compare the texts before the first star and after the last: between them all can stand."""
     if "*" not in one:
@@ -173,5 +198,5 @@ def _segment_source(segment: str) -> str:
     if "*" not in segment:
         return re.escape(segment) + "/"
     head, *between, tail = map(re.escape, segment.split("*"))
-    source = head + "".join(f"(?>[^/]*?{text})" for text in between if text)
-    return f"{source}(?>[^/]*{tail})/"
+    source = head + "".join(rf"(?>[^/\0]*?{text})" for text in between if text)
+    return rf"{source}(?>[^/\0]*{tail})/"

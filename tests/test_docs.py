@@ -19,6 +19,7 @@ import pytest
 from enact_dist.cli.main import build_parser
 from enact_dist.config.environment import variable_of, variables_of
 from enact_dist.config.read import load_config
+from enact_dist.config.rights import AllowTable, RightsConfig, SecurityConfig
 from enact_dist.config.table import keys_of
 from enact_dist.config.types import (
     ActorConfig,
@@ -26,7 +27,6 @@ from enact_dist.config.types import (
     CellConfig,
     PinTable,
     RetentionTable,
-    SecurityConfig,
     ShardConfig,
 )
 
@@ -52,7 +52,7 @@ _BLOCK = re.compile(
     re.DOTALL | re.MULTILINE,
 )
 _NAMED = re.compile(r"`(?:\.\./)*(\w+(?:[./]\w+)+)`")
-OBJECTS = {"actor", "actors", "cell", "shard", "world", "zenoh"}
+OBJECTS = {"actor", "actors", "cell", "rights", "shard", "world", "zenoh"}
 """Folders whose names stand for an object, event or file, too: `world.view`, `shard.ready`."""
 
 
@@ -283,17 +283,12 @@ def test_page_of_cell_toml_has_every_key_and_no_other():
     tables = re.findall(r"^\| key .*\n\|---.*\n((?:\|.*\n)+)", page, re.MULTILINE)
     explained = [set(re.findall(r"^\| `(\w+)` \|", rows, re.MULTILINE)) for rows in tables]
     kinds = (
-        CellConfig,
-        SecurityConfig,
-        ShardConfig,
-        PinTable,
-        AspectConfig,
-        RetentionTable,
-        ActorConfig,
-    )
+        CellConfig, ShardConfig, PinTable, AspectConfig, RetentionTable, ActorConfig,
+        SecurityConfig, RightsConfig, AllowTable,
+    )  # fmt: skip
     accepted = [set(keys_of(kind)) for kind in kinds]
-    lists = {"security", "shards", "pins", "aspects", "actors"}  # headings of the page
-    assert sorted(map(sorted, explained)) == sorted(sorted(keys - lists) for keys in accepted)
+    headings = {"shards", "pins", "aspects", "actors", "security", "rights", "allow"}
+    assert sorted(map(sorted, explained)) == sorted(sorted(keys - headings) for keys in accepted)
 
     variables = set(re.findall(r"^\| `(ENACT_\w+)` \|", page, re.MULTILINE))
     of_shards = {variable_of("name", key) for key in variables_of(ShardConfig)}

@@ -16,6 +16,7 @@ LAYERS = (
     ("comparing", "patterns", "retention"),
     ("terms",),
     ("core.protocol",),
+    ("core.rights",),
     ("core.state",),
     ("core.client", "core.offline", "core.shard"),
     ("wire",),

@@ -15,6 +15,7 @@ error    no such entity       the one `entity` of an actor does not match what i
 error    two types            one aspect name with two datum types
 error    own trigger          an actor that, as bound, writes what triggers it
 error    two writers          two actors that write one slot, not both declaring it as `shared`
+error    rights stale         `rights.toml` differs from what the actors declare, or is missing
 warning  entity unsaid        an actor without triggers names a pattern, and neither `cell.toml` nor
                               its class says for which entity: its `__init__` has to
 warning  unwritten trigger    a trigger that no actor writes: only a write from outside runs it
@@ -41,7 +42,8 @@ from typing import TYPE_CHECKING, Final, Literal
 
 from enact_dist.actor.running.doing import raised
 from enact_dist.actor.running.load import check_every_s, load_class, read_options
-from enact_dist.actor.uses import ActorDeclaration, uses_of
+from enact_dist.actor.uses import ActorDeclaration, declared_rights, uses_of
+from enact_dist.config.rights import RIGHTS_FILE, text_of_declared
 from enact_dist.config.table import suggestion
 from enact_dist.core.protocol.datum_types import newest, type_conflict
 from enact_dist.core.protocol.messages import AspectEntry
@@ -134,6 +136,8 @@ def check_cell(config: CellConfig, *, initial: Collection[str] = ()) -> tuple[Ac
         list(uses_of(actors)), {one.name for one in config.aspects if one.durability}
     )
     findings += _sets(actors, {entry.name: entry for entry in config.aspect_entries()})
+    if len(actors) == len(config.actors):
+        findings += _stale_rights(config, actors)
     named = {
         request.aspect.name
         for actor in actors
@@ -177,6 +181,33 @@ def declarations_of(config: CellConfig) -> tuple[list[ActorDeclaration], list[Ac
             text = f"actor {actor.name} ({actor.class_path}): {raised(error.__cause__ or error)}"
             findings.append(ActorFinding("error", "broken module", (actor.name,), text))
     return actors, findings
+
+
+def rights_text(config: CellConfig) -> str:
+    """Return `rights.toml` as it follows from the declarations of a cell's actors.
+
+    Raises:
+        ConfigError: An actor cannot be loaded.
+    """
+    actors, findings = declarations_of(config)
+    if findings:
+        raise ConfigError(findings[0].text, path=str(config.path))
+    return text_of_declared(declared_rights(actors))
+
+
+def _stale_rights(config: CellConfig, actors: Sequence[ActorDeclaration]) -> Iterator[ActorFinding]:
+    """Find a `rights.toml` that does not say what the actors declare."""
+    if config.rights is None or config.rights.default != "declared" or not actors:
+        return
+    file = config.path.parent / RIGHTS_FILE
+    try:
+        found = file.read_text("utf-8")
+    except OSError:
+        found = ""
+    if found != text_of_declared(declared_rights(actors)):
+        what = "differs from what the actors declare" if found else "is missing"
+        text = f"{file} {what}; write it with enact actor check --rights, then restart the shards"
+        yield ActorFinding("error", "rights stale", (), text)
 
 
 def _of_options(actor_class: type[Actor], options: Mapping[str, object]) -> type[Actor]:

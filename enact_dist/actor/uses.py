@@ -1,4 +1,8 @@
-"""What `actor.check` and `actor.graph` look at: actors of a cell and their requests."""
+"""What `actor.check` and `actor.graph` look at: actors of a cell and their requests.
+
+From the same declarations follow the rights of each actor (`declared_rights`): to read what it
+requests, and to write what it may write.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +10,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from enact_dist.actor.actor import narrowed, same_data, stands_for_trigger
+from enact_dist.actor.running.commands import ACTOR, COMMANDS
+from enact_dist.config.rights import AllowTable
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from enact_dist.actor.actor import Actor, Declared
     from enact_dist.terms import Entity
@@ -86,3 +92,22 @@ def uses_of(actors: Iterable[ActorDeclaration]) -> Iterator[Use]:
             world = actor.world_of(request.world.name)
             if world is not None:
                 yield Use(actor, name, request, world)
+
+
+def declared_rights(actors: Sequence[ActorDeclaration]) -> tuple[AllowTable, ...]:
+    """Return what each actor may do by its declaration, and obey commands to it.
+
+    A write gives the right to read, too, since a lock shows its data.
+    """
+    found: dict[str, tuple[set[str], set[str]]] = {}
+    for use in uses_of(actors):
+        reads, writes = found.setdefault(use.actor.name, (set(), set()))
+        _, entity, aspect = use.named.address
+        data = {f"{use.world}:{entity}/{aspect}"}
+        commands = {f"{use.world}:{ACTOR}/{COMMANDS}"}
+        reads |= data | commands
+        writes |= commands | (data if use.named.access.writes else set())
+    return tuple(
+        AllowTable((name,), tuple(sorted(reads)), tuple(sorted(writes)))
+        for name, (reads, writes) in found.items()
+    )

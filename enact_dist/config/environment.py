@@ -24,11 +24,11 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
+from enact_dist.config.rights import SecurityConfig
 from enact_dist.config.table import Field, fields_of, suggestion
 from enact_dist.config.types import (
     CARRIER_DEFAULT,
     CellConfig,
-    SecurityConfig,
     ShardConfig,
     is_locked,
     is_wildcard,

@@ -15,6 +15,13 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, NamedTuple
 
+from enact_dist.config.rights import (
+    RightsConfig,
+    SecurityConfig,
+    compiled_rights,
+    is_rights,
+    is_security,
+)
 from enact_dist.config.shows import GUESSED, Shows
 from enact_dist.config.table import TableKey
 from enact_dist.core.protocol.messages import AspectEntry, Pin, PlacementMap, ShardEntry
@@ -140,30 +147,6 @@ class ShardConfig:
     drain_s: Annotated[float | None, _DRAIN] = None
 
 
-@dataclass(frozen=True, slots=True)
-class SecurityConfig:
-    """The keys of a cell; without them, any program that reaches a port can join.
-
-    Attributes:
-        keys: The folder with this host's certificates and private keys; ``None``: the cell has
-            none.
-        operators: Names of people and tools that have a key, beside the shards and actors.
-    """
-
-    keys: Annotated[Path | None, TableKey(variable="KEYS")] = None
-    operators: Annotated[
-        tuple[str, ...], TableKey(make=partial(checked_name, "operator", slashes=False))
-    ] = ()
-
-
-def _security(found: object) -> SecurityConfig:
-    if not isinstance(found, SecurityConfig):
-        raise ValueError(  # noqa: TRY004 - what a table's reader catches
-            "'security' is a table; write [security] and below it keys = \"keys\""
-        )
-    return found
-
-
 class PinTable(NamedTuple):
     """The keys of a pin."""
 
@@ -279,12 +262,13 @@ class CellConfig:
         carrier: How messages travel between processes.
         shared_bytes_max: Cap of each shard's large data in shared memory, bytes.
         data_folder: Where shards without a `folder` of their own keep theirs, or ``None``.
-        security: The keys of the cell.
+        security: The keys of the cell, and who has every right.
         worlds: World contexts that exist from the start.
         shards: At least one, in the order of the file.
         pins: Entities kept on one shard; the first pin that matches wins.
         aspects: Aspects whose durability is fixed here.
         actors: Actors of the cell, in the order of the file.
+        rights: Who may do what; None: every client may do everything.
     """
 
     path: Annotated[Path, TableKey(given=True)]
@@ -295,8 +279,8 @@ class CellConfig:
     carrier: Annotated[str, TableKey(choices=CARRIERS, variable="CARRIER")] = CARRIER_DEFAULT
     shared_bytes_max: Annotated[int | None, TableKey(variable="SHARED_BYTES_MAX")] = None
     data_folder: Annotated[Path | None, TableKey(variable="DATA_FOLDER")] = None
-    security: Annotated[SecurityConfig, TableKey(table=SecurityConfig, make=_security)] = (
-        SecurityConfig()
+    security: Annotated[SecurityConfig, TableKey(table=SecurityConfig, make=is_security)] = field(
+        default_factory=SecurityConfig
     )
     worlds: Annotated[
         tuple[str, ...], TableKey(make=partial(checked_name, "world context", slashes=False))
@@ -305,6 +289,12 @@ class CellConfig:
     pins: Annotated[tuple[Pin, ...], TableKey(table=PinTable, make=Pin._make)] = ()
     aspects: tuple[AspectConfig, ...] = ()
     actors: tuple[ActorConfig, ...] = ()
+    rights: Annotated[RightsConfig | None, TableKey(table=RightsConfig, make=is_rights)] = None
+
+    @property
+    def actor_names(self) -> tuple[str, ...]:
+        """Names of its actors."""
+        return tuple(actor.name for actor in self.actors)
 
     @property
     def ttl_ns(self) -> int:
@@ -350,16 +340,22 @@ class CellConfig:
         """Return what the core of shard `name` has to know.
 
         Raises:
-            ConfigError: The cell has none of that name.
+            ConfigError: The cell has none of that name, or its `rights.toml` is missing.
         """
         from enact_dist.core.shard.state import ShardSettings
 
+        rights = self.rights
         return ShardSettings(
             name=self.shard(name).name,
             placement=self.placement_map(),
             worlds=self.worlds,
             aspects=self.aspect_entries(),
             ttl_ns_max=self.ttl_ns,
+            rights=None
+            if rights is None
+            else compiled_rights(
+                rights, self.path, actors=self.actor_names, operators=self.security.operators
+            ),
         )
 
 

@@ -24,7 +24,6 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from contextlib import ExitStack
 from threading import get_ident
 from typing import TYPE_CHECKING, Final, cast
 
@@ -46,15 +45,13 @@ from enact_dist.core.protocol.records import (
     Persist,
     Persisted,
     Publish,
-    Recovered,
     Reply,
     Story,
     Tick,
 )
 from enact_dist.core.shard import owners
 from enact_dist.core.shard.shard import Shard
-from enact_dist.core.state.catalogue import REMEDY
-from enact_dist.core.state.clock import state_of, unkept_epoch
+from enact_dist.core.state.clock import state_of
 from enact_dist.errors import StoreError
 from enact_dist.link.clock import Clock, SystemClock
 from enact_dist.link.host_figures import Stalls, figures_of, latencies_of
@@ -64,11 +61,10 @@ from enact_dist.link.signals import Uninterrupted
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
     from enact_dist.core.protocol.messages import Answer, Notice, Request
     from enact_dist.core.protocol.records import Call, Event
-    from enact_dist.core.shard.state import ShardSettings
+    from enact_dist.core.rights.rules import Rights
     from enact_dist.core.state.clock import Latencies
     from enact_dist.link.memory.shared_folder import SharedFolder
     from enact_dist.link.store.store import Store
@@ -86,48 +82,6 @@ JOIN_S: Final = 0.5
 """How long a closing host waits for its timer; a drain has to be over within 2 s."""
 
 _log = logging.getLogger("enact.shard")
-
-
-def open_host(
-    settings: ShardSettings,
-    folder: Path | None,
-    *,
-    clock: Clock | None = None,
-    on_failure: Callable[[Exception], None] | None = None,
-    shared: SharedFolder | None = None,
-    payload_bytes_max: int | None = None,
-) -> ShardHost:
-    """Open a shard's folder and run the shard; without a folder no data outlive the process.
-
-    Raises:
-        StoreError: The folder is in use, unreadable or corrupt, or holds entities of other shards.
-    """
-    clock = clock or SystemClock()
-    wall_ns = clock.wall_ns()
-    if folder is None:
-        store, recovered = None, Recovered(epoch=unkept_epoch(wall_ns))
-    else:
-        from enact_dist.link.folder.folder import refuse_far_stamps, refuse_strangers
-        from enact_dist.link.store.store import open_store
-
-        store, recovered = open_store(folder, unix_s=wall_ns // 1_000_000_000)
-        with ExitStack() as undo:
-            undo.callback(store.close)
-            refuse_strangers(folder, recovered, settings.name, settings.placement)
-            refuse_far_stamps(folder, recovered, wall_ns=wall_ns)
-            undo.pop_all()
-    shard = Shard(settings, recovered, now_ns=clock.monotonic_ns(), wall_ns=wall_ns)
-    if left_out := shard.state.catalogue.shown().left_out:
-        what = "world contexts and aspects do not fit into the catalogue sent to clients"
-        _log.warning("shard %s: %d %s; %s", settings.name, left_out, what, REMEDY)
-    return ShardHost(
-        shard,
-        store=store,
-        clock=clock,
-        on_failure=on_failure,
-        shared=shared,
-        payload_bytes_max=payload_bytes_max,
-    )
 
 
 class ShardHost:
@@ -235,11 +189,18 @@ class ShardHost:
         """Why the host failed, or None while it lives."""
         return self._failure
 
-    def submit(self, message: Request, reply: Callable[[Answer], None], identity: str = "") -> None:
+    def submit(
+        self,
+        message: Request,
+        reply: Callable[[Answer], None],
+        identity: str = "",
+        subject: str | None = None,
+    ) -> None:
         """Pass a request to the shard; `reply` is called once, now or later, from any thread.
 
         If the host ends or fails first, `reply` is never called: no answer means *unknown*.
-        `identity` is the sender as the transport knows it ("": this process).
+        `identity` is the sender as the transport knows it ("": this process), `subject` the one
+        whose rights it uses (None: the transport vouches for no name).
         """
         kind = type(message)
         if kind is Commit or kind is Prepare:
@@ -247,7 +208,7 @@ class ShardHost:
             if names_payloads(commit) and self._refusal(commit, identity) is None:
                 message = self._payloads.with_bodies(commit)  # otherwise staged data stay
         elif kind is Stage:
-            self._stage(cast("Stage", message), reply, identity)
+            self._stage(cast("Stage", message), reply, identity, subject)
             return
         elif kind is ListSessions:
             self._shard.counters.update(self._payloads.figures())
@@ -260,22 +221,37 @@ class ShardHost:
                 return
             self._handles += 1
             self._replies[self._handles] = reply
-            self._handle(message, self._handles, identity)
+            self._handle(message, self._handles, identity, subject)
             if self._handles in self._replies or kind is Hello:
                 self._look_at_clock_for(message)
 
-    def _stage(self, message: Stage, reply: Callable[[Answer], None], identity: str) -> None:
+    def _stage(
+        self,
+        message: Stage,
+        reply: Callable[[Answer], None],
+        identity: str,
+        subject: str | None,
+    ) -> None:
         if self._ended:
             return
         refusal = self._refusal(message, identity)
         if message.total and message.session not in self._shard.state.sessions.by_id:
             refusal = refusal or EpochChanged(self.epoch)
+        if refusal is None and self.rights is not None:
+            with self._mutex:
+                refusal = self._shard.denied(message, identity, subject)
         reply(refusal or self._payloads.stage(message, identity))
 
     def _refusal(self, message: Request, identity: str) -> Refused | EpochChanged | None:
         """Return why the shard will refuse a message because of its sender, else None."""
         state = self._shard.state
         return owners.refusal(message, identity, state.sessions, self.epoch) if identity else None
+
+    @property
+    def rights(self) -> Rights | None:
+        """The rights of the cell; None: every client may do everything."""
+        guard = self._shard.state.guard
+        return guard.rights if guard is not None else None
 
     def owner_of(self, session: str) -> str:
         """Return the identity of a session; "" if unknown.  Takes no mutex."""
@@ -333,15 +309,23 @@ class ShardHost:
 
     # ---------------------------------------------------------------- messages in, effects out
 
-    def _handle(self, message: Request | Event, handle: int, identity: str = "") -> None:
+    def _handle(
+        self,
+        message: Request | Event,
+        handle: int,
+        identity: str = "",
+        subject: str | None = None,
+    ) -> None:
         """Let the shard decide, and perform its effects.  The mutex is held."""
         if get_ident() == self._uninterrupted.main:
             with self._uninterrupted:
-                self._handle_now(message, handle, identity)
+                self._handle_now(message, handle, identity, subject)
         else:
-            self._handle_now(message, handle, identity)
+            self._handle_now(message, handle, identity, subject)
 
-    def _handle_now(self, message: Request | Event, handle: int, identity: str) -> None:
+    def _handle_now(
+        self, message: Request | Event, handle: int, identity: str, subject: str | None
+    ) -> None:
         clock = self._clock
         later: list[Publish | Story] = []
         try:
@@ -349,6 +333,7 @@ class ShardHost:
                 message,
                 reply_to=handle,
                 identity=identity,
+                subject=subject,
                 now_ns=clock.monotonic_ns(),
                 wall_ns=clock.wall_ns(),
             ):

@@ -53,6 +53,13 @@ _CLASSES: Final[dict[str, type[EnactError]]] = {
 }
 """The exception of each code of a refusal; any other code is a `LinkError`."""
 
+_NO_RIGHT: Final = re.compile(
+    r"(?P<identity>.+?) may not (?P<right>[a-z]+)\b"
+    r"(?: (?P<world>[^\s:/]+):(?P<entity>[^\s:]+)/(?P<aspect>[^\s:/]+))?"
+    r"[^:\n]*: it .*\((?P<rule>[^()]+)\)\Z"
+)
+"""How `core.rights` words a missing right."""
+
 
 def unreachable(
     shard: str, waited_s: float, carrier: Carrier, *, runs: bool = False
@@ -214,6 +221,8 @@ def error_of(refused: Refused | Forgotten) -> EnactError:
     if refused.code == "clock_skew":
         ahead = re.search(r"(\d+\.\d+) s ahead", refused.text)
         return ClockSkewError(refused.text, ahead_s=float(ahead[1]) if ahead else 0.0)
+    if refused.code == PERMISSION and (found := _NO_RIGHT.match(refused.text)) is not None:
+        return PermissionDeniedError(refused.text, **found.groupdict(""))
     return _CLASSES.get(refused.code, LinkError)(refused.text)
 
 

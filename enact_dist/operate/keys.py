@@ -79,7 +79,7 @@ def owners_of(config: CellConfig) -> tuple[KeyOwner, ...]:
         KeyOwner(shard_identity(one.name), _hosts_of((*one.listen, *one.advertise)))
         for one in config.shards
     ]
-    names = [*(actor.name for actor in config.actors), *config.security.operators]
+    names = [*(actor.name for actor in config.actors), *config.security.key_holders]
     for name in names:
         if name.startswith(SHARD_PREFIX) or f"{name}.pem" == AUTHORITY:
             raise ConfigError(

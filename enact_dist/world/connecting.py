@@ -22,7 +22,8 @@ from enact_dist.world.cell import Cell
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from enact_dist.config.types import CellConfig, SecurityConfig
+    from enact_dist.config.rights import SecurityConfig
+    from enact_dist.config.types import CellConfig
     from enact_dist.link.clock import Clock
 
 TTL_S: Final = 2.0
@@ -147,7 +148,7 @@ def local(
     from enact_dist.core.shard.state import ShardSettings
     from enact_dist.link.client.locks import CellClient
     from enact_dist.link.daemon.embedded import EmbeddedCarrier
-    from enact_dist.link.host import open_host
+    from enact_dist.link.opening import open_host
 
     names = dict.fromkeys((*_world_names(worlds), *(config.worlds if config else ())))
     settings = ShardSettings(

@@ -6,7 +6,7 @@ import pytest
 
 from enact_dist.config.environment import security_of
 from enact_dist.config.read import parse_config
-from enact_dist.config.types import SecurityConfig
+from enact_dist.config.rights import SecurityConfig
 from enact_dist.errors import ConfigError
 
 SHARD = 'name = "c"\n[shards.left]\nlisten = "{}"\n'

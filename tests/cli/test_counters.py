@@ -7,8 +7,8 @@ import enact_dist
 from enact_dist.core.protocol.messages import ListSessions, PlacementMap, ShardEntry
 from enact_dist.core.shard.state import ShardSettings
 from enact_dist.link.daemon.counters import OF_A_CONNECTION, OF_A_SHARD, described
-from enact_dist.link.host import open_host
 from enact_dist.link.memory.payload_desk import PayloadDesk
+from enact_dist.link.opening import open_host
 
 OF_CLIENTS = (
     "client/locks.py",

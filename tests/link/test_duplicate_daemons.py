@@ -8,7 +8,7 @@ import pytest
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
 from enact_dist.cli.shard.shard import _state
-from enact_dist.config.types import SecurityConfig
+from enact_dist.config.rights import SecurityConfig
 from enact_dist.core.protocol.messages import (
     ListPlaces,
     ListSessions,

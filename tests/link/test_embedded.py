@@ -8,7 +8,7 @@ import pytest
 from enact_dist.core.protocol.messages import Granted, ListLocks, ListSessions, Locks
 from enact_dist.errors import MisuseError, ShardUnreachableError
 from enact_dist.link.daemon.embedded import EmbeddedCarrier
-from enact_dist.link.host import open_host
+from enact_dist.link.opening import open_host
 
 
 @pytest.fixture

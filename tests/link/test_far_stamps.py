@@ -10,8 +10,8 @@ from store_writer import fill, persist, slot_record, versions
 from enact_dist.core.protocol.parts import PlacementMap, ShardEntry
 from enact_dist.core.shard.state import ShardSettings
 from enact_dist.errors import StoreError
-from enact_dist.link.host import open_host
 from enact_dist.link.offline.backup import back_up, restore
+from enact_dist.link.opening import open_host
 from enact_dist.link.store.store import open_store
 
 NAMES = {"cell": "line", "shard": "left"}

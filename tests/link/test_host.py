@@ -20,7 +20,8 @@ from enact_dist.core.shard.shard import Shard
 from enact_dist.errors import StoreError
 from enact_dist.link.clock import SystemClock
 from enact_dist.link.daemon.embedded import EmbeddedCarrier
-from enact_dist.link.host import ShardHost, open_host
+from enact_dist.link.host import ShardHost
+from enact_dist.link.opening import open_host
 
 
 class ManualClock:

@@ -11,7 +11,7 @@ pytest.importorskip("cryptography", reason="making keys needs the extra 'keys'")
 import key_cells
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
-from enact_dist.config.types import SecurityConfig
+from enact_dist.config.rights import SecurityConfig
 from enact_dist.errors import ConfigError, ShardUnreachableError
 from enact_dist.link.daemon import health
 from enact_dist.link.daemon.daemon import start_shard

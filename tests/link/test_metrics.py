@@ -19,7 +19,7 @@ from enact_dist.core.state.clock import Latencies
 from enact_dist.errors import LinkError
 from enact_dist.link.daemon import metrics
 from enact_dist.link.daemon.metrics import CONTENT_TYPE, METRICS, MetricsServer, page, table
-from enact_dist.link.host import open_host
+from enact_dist.link.opening import open_host
 
 DOCUMENT = Path(__file__).parents[2] / "deploy" / "metrics.md"
 DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))

@@ -187,9 +187,9 @@ def test_slices_that_wait_for_their_place_are_bounded(daemon, endpoint, raw, mon
     shard, full = daemon(endpoint), threading.Event()
     take, count = shard.host._stage, shard.host.count
 
-    def take_later(message, reply, identity):
+    def take_later(message, reply, identity, subject=None):
         full.wait(10)
-        take(message, reply, identity)
+        take(message, reply, identity, subject)
 
     def note(name, amount=1):
         count(name, amount)

@@ -67,7 +67,7 @@ class Stopped:
         self.submitted = []
         submit = self.host.submit
 
-        def noting(message, reply, identity=""):
+        def noting(message, reply, identity="", subject=None):
             self._begun.set()
             submit(message, reply, identity)
             self.submitted.append(identity)

@@ -17,7 +17,7 @@ from enact_dist.cli.arguments import (
     pair,
     seconds_of,
 )
-from enact_dist.cli.verbs import LOOKS, Verb, many, option
+from enact_dist.cli.verbs import LOOKS, Verb, flag, many, option
 
 _NAME: Final = option("name", "NAME", "name of the actor, as enact actor ls shows it")
 
@@ -96,6 +96,8 @@ VERBS: Final = (
             file_of("--graph", "FILE.svg",
                     "draw entities, aspects and actors with all declared reads and writes; of a"
                     " running cell, with the rate of each actor"),
+            flag("--rights", "write rights.toml beside the cell.toml: what each actor may read and"
+                 " write by its declaration"),
         ),
     ),
 )  # fmt: skip

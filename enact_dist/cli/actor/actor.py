@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.cli.target import cell_config, see_modules
 from enact_dist.cli.text.output import print_json
 from enact_dist.cli.verbs import DONE, FAILED, Output
+from enact_dist.config.rights import RIGHTS_FILE
 from enact_dist.errors import ConfigError, EnactError, ProtocolError
 from enact_dist.world.trees import shown_s
 
@@ -106,6 +107,8 @@ def check_actors(options: argparse.Namespace) -> int:
 
     config = cell_config(options)
     see_modules(config.path)
+    if options.rights:
+        _write_rights(config)
     findings = check_cell(config, initial=options.initial)
     wrong = any(finding.level == "error" for finding in findings)
     if options.json:
@@ -118,6 +121,20 @@ def check_actors(options: argparse.Namespace) -> int:
     if options.graph is not None:
         _draw(config, options.graph)
     return FAILED if wrong else DONE
+
+
+def _write_rights(config: CellConfig) -> None:
+    """Write what the actors may do by their declarations, for the shards.
+
+    Raises:
+        ConfigError: An actor cannot be loaded, so that its declaration is unknown.
+        OSError: The file cannot be written.
+    """
+    from enact_dist.actor.check import rights_text
+
+    file = config.path.parent / RIGHTS_FILE
+    file.write_text(rights_text(config), "utf-8")
+    print(f"written: {file}; restart the shards so that they read it", file=sys.stderr)
 
 
 def _draw(config: CellConfig, file: Path) -> None:

@@ -143,6 +143,8 @@ def surveyed(state: ShardState, message: Survey, *, stamp_ns: int) -> Surveyed:
     """List the slots that match, null ones too, without their data; retained versions if asked."""
 
     def listed(slot: Slot, newest: Content, above: int) -> tuple[Iterator[SlotState], int]:
+        if state.hides(slot):
+            return iter(()), 1
         replaced = state.slots.history.of(slot) if message.retained else None
         contents = [*replaced.retained(), newest] if replaced is not None else [newest]
         begin = bisect_right(contents, above, key=lambda content: content.version) if above else 0

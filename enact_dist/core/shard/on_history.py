@@ -104,6 +104,9 @@ class LineageDesk:
         begin, slots = max(0, message.after.number), self._state.slots
         for number, (slot, version) in enumerate(message.versions[begin:], begin + 1):
             after = Cursor(self._state.epoch, number=number)
+            if self._state.hides(slot):
+                yield None, 0, 1, after
+                continue
             one = slots.versions(slot, version=version or slots[slot].version)
             found = entries_of(slots, slot, one)
             entry = next(found, None)
@@ -138,7 +141,7 @@ class LineageDesk:
         def listed(slot: Slot, newest: Content, above: int) -> tuple[Iterable[VersionEntry], int]:
             nonlocal looked
             looked = 0
-            if newest.stamp_ns < since_ns:
+            if newest.stamp_ns < since_ns or self._state.hides(slot):
                 return (), 0
             found = [
                 (content, until_ns)
@@ -183,6 +186,8 @@ class HistoryDesk:
         slots = self._state.slots
 
         def listed(slot: Slot, _: Content, above: int) -> tuple[Iterable[VersionEntry], int]:
+            if self._state.hides(slot):
+                return (), 1
             history = slots.history.of(slot)
             kept = history.kept if history is not None else {}
             found = [

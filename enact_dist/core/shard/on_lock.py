@@ -278,7 +278,14 @@ class LockDesk:
         if self._state.session_in_epoch(message.lock.session, message.epoch) is None:
             yield Reply(reply_to, EpochChanged(self._state.epoch))
             return
-        datum = self._pinned(message)
+        datum, refusal = self._pinned(message), None
+        if datum is None:
+            guard = self._state.guard
+            refusal = guard.may_not_read(message.slot) if guard is not None else None
+            datum = self._current(message)
+        if refusal is not None:
+            yield Reply(reply_to, refusal)
+            return
         if datum is None:
             self._state.count("fetches_gone")
             yield Reply(reply_to, Gone(message.slot, message.version))
@@ -311,6 +318,9 @@ class LockDesk:
         for pins in (tenure.pins if tenure else {}, self._state.pins.get(message.lock)):
             if key in pins:
                 return pins[key]
+        return None
+
+    def _current(self, message: Fetch) -> Datum | None:
         content = self._state.slots[message.slot]
         return content.datum if content.version == message.version else None
 

@@ -89,6 +89,7 @@ if TYPE_CHECKING:
 
     from enact_dist.core.protocol.messages import Notice, Request
     from enact_dist.core.protocol.records import Event
+    from enact_dist.core.rights.rules import Rights
 
 _DECIDE: Final = frozenset((Persisted, Called, Drain))
 """After these, what was undecided may be decided; without a store after any message."""
@@ -181,6 +182,7 @@ class Shard:
         *,
         reply_to: int = 0,
         identity: str = "",
+        subject: str | None = None,
         now_ns: int,
         wall_ns: int,
     ) -> list[Effect]:
@@ -190,6 +192,7 @@ class Shard:
             message: A request of a client, or an event of this host.
             reply_to: Handle under which the request's answer will be asked to be sent.
             identity: The caller, as the transport knows it; see `core.shard.owners`.
+            subject: Whose rights it uses, see `core.rights.rules`; None: no name is proven.
             now_ns: This host's monotonic clock.
             wall_ns: This host's wall clock, since 1970; used for stamps only.
         """
@@ -207,6 +210,9 @@ class Shard:
         refusal = (
             owners.refusal(message, identity, state.sessions, state.epoch) if identity else None
         )
+        guard = state.guard
+        if guard is not None:
+            refusal = refusal or self.denied(message, identity, subject)
         if refusal is None:
             found = self._handlers[type(message)](message, reply_to)
             effects: list[Effect] = found if type(found) is list else list(found)
@@ -214,8 +220,10 @@ class Shard:
             effects = [Reply(reply_to, refusal)]
             if type(refusal) is EpochChanged:
                 state.count("epoch_refusals")
-            else:
+            elif guard is None or not guard.denials:
                 state.count("requests_refused")
+        if guard is not None and guard.denials:
+            effects += guard.stories(now_ns)
         if self._stamps.waits and not state.stored:
             effects += self._stamps.answer_reached()
         if self._views.waits or self._worlds.waits:
@@ -234,6 +242,33 @@ class Shard:
         if state.tenures.table.ready:
             effects += state.grant_ready()
         return effects
+
+    def denied(
+        self, message: Request | Event, identity: str, subject: str | None
+    ) -> Refused | None:
+        """Return why a sender has not the right to ask that, else None; see `handle`."""
+        state = self.state
+        if state.guard is None:
+            return None
+        state.guard.begin(identity, subject)
+        if isinstance(message, Acquire | TakeView):
+            session = state.sessions.by_id.get(message.lock.session)
+            if message.epoch != state.epoch or session is None or not session.present:
+                return None  # its answer is that the epoch has changed
+        return state.guard.refusal(message, state.catalogue.worlds)
+
+    def take_rights(self, rights: Rights) -> None:
+        """Replace the rights, from the next message on; held locks end with their commit.
+
+        Raises:
+            ValueError: The shard was started without rights.
+        """
+        if self.state.guard is None:
+            raise ValueError("a shard that was started without rights takes none later")
+        self.state.guard.rights = rights
+        kept = self.state.tenures.kept
+        for tenure in list(kept.by_number.values()):
+            kept.recall(tenure, now_ns=self.state.now_ns)
 
     def keep_nothing(self) -> None:
         """Go on without a store from the start: what waits for records does so at once."""

@@ -21,6 +21,7 @@ from enact_dist.core.protocol.messages import (
     WorldEntry,
 )
 from enact_dist.core.protocol.records import Effect, Persist, Reply
+from enact_dist.core.rights.guard import Guard
 from enact_dist.core.shard.owners import Quotas
 from enact_dist.core.state.audit import Audit
 from enact_dist.core.state.catalogue import Catalogue
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
         KeepVersions,
     )
     from enact_dist.core.protocol.records import Record, Recovered, Then
+    from enact_dist.core.rights.rules import Rights
     from enact_dist.core.state.tenure import Tenure
     from enact_dist.terms import Durability
 
@@ -71,6 +73,7 @@ class ShardSettings:
         shared: Name of this start's folder of shared memory ("": it shares none).
         shared_nonce: Content of its nonce file, for clients.
         start: A random number of this start.
+        rights: Who may do what; None: every client may do everything.
     """
 
     name: str
@@ -82,6 +85,7 @@ class ShardSettings:
     shared: str = ""
     shared_nonce: bytes = b""
     start: int = 0
+    rights: Rights | None = None
 
 
 class Pins:
@@ -279,6 +283,7 @@ class ShardState:
         by_hand: The last lock broken and the last one aborted by operators: request and answer.
         stored: Whether there is a store; without one, records are kept as long as this process.
         draining: The shard is about to stop and grants nothing.
+        guard: Compares requests with the rights of their senders; None: there are none.
         doubled: The shards of the cell that several daemons serve now, with the start of each.
     """
 
@@ -289,6 +294,8 @@ class ShardState:
         self.epoch = recovered.epoch
         self.now_ns, self.wall_ns, self.born_ns = now_ns, wall_ns, now_ns
         self.asker = ""
+        rights = settings.rights
+        self.guard = Guard(rights, self.count) if rights is not None else None
         self.draining = False
         self.stored = True
         self._then: dict[int, Then] = {}
@@ -340,7 +347,12 @@ class ShardState:
             decisions=self.decisions,
             counters=self.counters,
             persist=self.persist,
+            guard=self.guard,
         )
+
+    def hides(self, slot: Slot) -> bool:
+        """Whether a listing leaves a slot out, which the sender of the request may not read."""
+        return self.guard is not None and self.guard.hides(slot)
 
     def count(self, name: str, count: int = 1) -> None:
         """Add to one of the shard's statistics."""

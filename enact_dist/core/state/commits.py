@@ -77,6 +77,7 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.datum import LockId, Token
     from enact_dist.core.protocol.messages import Cause, Prepare
     from enact_dist.core.protocol.records import Then
+    from enact_dist.core.rights.guard import Guard
     from enact_dist.core.state.catalogue import Catalogue
     from enact_dist.core.state.clock import Stamps
     from enact_dist.core.state.decisions import Decisions
@@ -110,6 +111,7 @@ class Commits:
         "_counters",
         "_decisions",
         "_epoch",
+        "_guard",
         "_in_flight",
         "_peers",
         "_persist",
@@ -135,6 +137,7 @@ class Commits:
         decisions: Decisions,
         counters: dict[str, int],
         persist: Callable[[tuple[Record, ...], Durability, Then], list[Effect]],
+        guard: Guard | None = None,
     ) -> None:
         self._decisions = decisions
         self._shard = shard
@@ -148,6 +151,7 @@ class Commits:
         self._counters = counters
         self._in_flight: dict[LockId, _InFlight] = {}
         self._persist = persist
+        self._guard = guard
         self.notice_number = 0
 
     def undecided(self) -> Iterator[tuple[int, tuple[WriteItem, ...]]]:
@@ -387,6 +391,8 @@ class Commits:
                 whole = False
             if not (slot in wants and wants[slot] is X) and not tenure.covers(slot):
                 return Refused("protocol", f"{message.lock} does not hold {slot} for writing")
+        if self._guard is not None and (denied := self._guard.may_not_write(writes, self._slots)):
+            return denied
         if new:
             # Everybody whose pattern covers a slot must be able to read its name.
             for slot, _ in writes:

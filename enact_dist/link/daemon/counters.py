@@ -157,6 +157,10 @@ OF_A_SHARD: Final[dict[str, Figure]] = {
         "requests refused because their process used up its share of the shard",
         "the shard's log names the process; a typical cause is a program that connects in a loop",
     ),
+    "permission_denied": Figure(
+        "requests refused because the rights of the cell do not allow them",
+        "the shard's log names sender and right; see [rights] in cell.toml",
+    ),
     "sessions_displaced": Figure(
         "idle sessions ended to make room in a full table",
         "see the shard's log: some program opens new sessions in a loop",

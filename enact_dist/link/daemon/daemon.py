@@ -35,9 +35,9 @@ from enact_dist.link.client.duplicate_daemons import (
 from enact_dist.link.daemon.key_watch import KeyWatch, checked_keys
 from enact_dist.link.daemon.service_manager import ServiceManager
 from enact_dist.link.daemon.shard_calls import ShardCalls
-from enact_dist.link.host import open_host
 from enact_dist.link.log import READY, JsonLines, Log, TextLines, say
 from enact_dist.link.memory.shared_folder import SharedFolder
+from enact_dist.link.opening import open_host
 from enact_dist.link.signals import StopSignals
 from enact_dist.link.socket.service import SocketService
 from enact_dist.link.zenoh.config import close_session, listening_settings, open_session, to_reach

@@ -10,9 +10,10 @@ from __future__ import annotations
 import logging
 import socket
 import threading
-from typing import Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
 from enact_dist.core.protocol.messages import Answer, Outcome, Refused, Release, Request, Survey
+from enact_dist.core.rights.rules import UNPROVEN, path_of
 from enact_dist.core.shard.owners import SESSION_OF, not_yours
 from enact_dist.errors import LinkError, ProtocolError
 from enact_dist.link.answers import encoded, size_of
@@ -31,6 +32,9 @@ from enact_dist.link.socket.peers import PeerCredentials
 from enact_dist.link.socket.watcher import Publisher, SocketWatcher
 from enact_dist.patterns import checked_patterns
 from enact_dist.wire.frames import decode_frame, decode_request
+
+if TYPE_CHECKING:
+    from enact_dist.core.protocol.datum import Slot
 
 OPEN_S: Final = 1.0
 """How long a new connection may take to name its session."""
@@ -59,6 +63,7 @@ class SocketConnection:
     Attributes:
         session: The session it speaks for; empty until the service has admitted it.
         identity: Owner of that session.
+        subject: Whose rights it uses; None: the shard has no rights.
         peer: The process at the other end, according to the kernel.
         step: 3n while it waits for its n-th request, 3n + 1 once it has read it, 3n + 2 once the
             host has it.
@@ -67,7 +72,7 @@ class SocketConnection:
 
     __slots__ = (
         "_answer", "_answered", "_late", "_rest", "_service", "_stream", "_thread", "connected",
-        "ended", "identity", "peer", "session", "step",
+        "ended", "identity", "peer", "session", "step", "subject",
     )  # fmt: skip
 
     def __init__(self, service: Admission, connected: socket.socket) -> None:
@@ -80,6 +85,7 @@ class SocketConnection:
         self._rest: memoryview | None = None
         self.connected = connected
         self.session = self.identity = ""
+        self.subject: str | None = None
         self.peer = PeerCredentials(0, 0, 0)
         self.step = 2
         self.ended = threading.Event()
@@ -145,7 +151,9 @@ class SocketConnection:
             if kind != FrameKind.MESSAGE:
                 if kind == FrameKind.WATCH:
                     self.step = step + 1
-                    SocketWatcher(self._service, self.connected, _interest(header)).run()
+                    may_read = self._may_read if host.rights is not None else None
+                    interest = _interest(header)
+                    SocketWatcher(self._service, self.connected, interest, may_read).run()
                     return
                 raise ProtocolError(f"a frame of kind {kind} came instead of a request")
             try:
@@ -161,13 +169,17 @@ class SocketConnection:
                 self.step = step = step + 1
                 self._send(not_yours(session, "another connection", self.identity))
                 continue
-            host.submit(message, self._take, self.identity)
+            host.submit(message, self._take, self.identity, self.subject)
             self.step = step = step + 1
             answer, self._answer = self._answer, None
             if answer is not None:
                 self._send(answer)
             else:
                 self._send_late()
+
+    def _may_read(self, slot: Slot) -> bool:
+        rights = self._service.host.rights
+        return rights is None or rights.may(self.subject or UNPROVEN, "read", path_of(slot))
 
     def _may_name(self, session: str, message: Request) -> bool:
         """Whether a message may name another session, as a question for a commit's outcome does.

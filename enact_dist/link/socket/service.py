@@ -18,6 +18,7 @@ import time
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
+from urllib.parse import unquote
 
 from enact_dist.core.protocol.records import SessionDied
 from enact_dist.core.shard.owners import not_yours
@@ -118,6 +119,7 @@ class SocketService:
         """
         peer = check_peer(connection.connected, users=self._users, group=self._access.group)
         connection.peer = peer
+        connection.subject = self._subject_of(connection.identity, peer)
         owner, asker = self.host.owner_of(session), connection.identity
         if owner and owner != asker:  # else the end of this process would end that session
             raise LinkError(not_yours(session, owner, asker).text)
@@ -139,6 +141,24 @@ class SocketService:
         if problem:
             raise LinkError(problem)
         self._deaths.connected(session, connection.connected)
+
+    def _subject_of(self, identity: str, peer: PeerCredentials) -> str | None:
+        """Return whose rights a process uses, by its user; None: the shard has no rights.
+
+        Raises:
+            LinkError: Its user has none.
+        """
+        rights = self.host.rights
+        if rights is None:
+            return None
+        name = unquote(identity.partition("@")[0])
+        subject = rights.subject_of(peer.user, name, trusted=peer.user in self._users)
+        if not subject:
+            raise LinkError(
+                f"user {peer.user} of process {peer.pid} has no rights at shard {self.host.name};"
+                f" add it to `uids`: {rights.hint}"
+            )
+        return subject
 
     def _problem_with(
         self, session: str, mine: set[SocketConnection], peer: PeerCredentials

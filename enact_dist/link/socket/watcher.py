@@ -4,7 +4,8 @@ The queue holds up to `NOTICES_MAX` notices; further ones are dropped and counte
 sees the gap in their numbers.
 
 Notices that it does not watch are not sent, since each would wake a process for nothing.  It gets
-only their numbers, before the next notice or once they are `SKIP_S` old.
+only their numbers, before the next notice or once they are `SKIP_S` old.  The same holds for
+changes of slots that its client may not read.
 """
 
 from __future__ import annotations
@@ -15,12 +16,17 @@ import socket
 import threading
 import time
 from collections import deque
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final, Protocol
 
 from enact_dist.link.notices import Skipped
 from enact_dist.link.socket.frames import FrameKind, prefixed, skipped_frame
+from enact_dist.wire.frames import encode_frame
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from enact_dist.core.protocol.datum import Slot
     from enact_dist.core.protocol.messages import Notice
     from enact_dist.link.host import ShardHost
     from enact_dist.link.notices import Interest
@@ -49,13 +55,18 @@ class SocketWatcher:
     """One watching connection; its own thread calls `run`, publishing threads call `put`."""
 
     __slots__ = (
-        "_bell", "_connected", "_interest", "_mutex", "_service", "_skipped", "_skipped_s",
-        "_waiting",
+        "_bell", "_connected", "_interest", "_may_read", "_mutex", "_service", "_skipped",
+        "_skipped_s", "_waiting",
     )  # fmt: skip
 
     def __init__(
-        self, service: Publisher, connected: socket.socket, interest: Interest | None
+        self,
+        service: Publisher,
+        connected: socket.socket,
+        interest: Interest | None,
+        may_read: Callable[[Slot], bool] | None = None,
     ) -> None:
+        self._may_read = may_read
         self._service = service
         self._interest = interest
         self._skipped: Skipped | None = None
@@ -68,9 +79,16 @@ class SocketWatcher:
 
     def put(self, notice: Notice, frame: bytes) -> None:
         """Send the frame of a notice, if it is watched; by one thread at a time."""
-        kept = True
+        kept, hidden = True, False
+        if self._may_read is not None:
+            whole = notice
+            notice = self._readable(whole, self._may_read)
+            hidden = notice is not whole and not notice.changes
+            if notice is not whole and not hidden:
+                header, payload = encode_frame(notice)
+                frame = prefixed(header, len(payload or b"")) + (payload or b"")
         with self._mutex:
-            if self._interest is None or self._interest.covers(notice):
+            if not hidden and (self._interest is None or self._interest.covers(notice)):
                 kept = self._send(self._taken_skipped() + frame)
             elif self._skipped is None:
                 number = notice.number
@@ -80,6 +98,12 @@ class SocketWatcher:
                 shard, epoch, after, _ = self._skipped
                 self._skipped = Skipped(shard, epoch, after, notice.number)
         self._count(kept=kept)
+
+    @staticmethod
+    def _readable(notice: Notice, may_read: Callable[[Slot], bool]) -> Notice:
+        """Return a notice without the changes that the client may not see."""
+        changes = tuple([change for change in notice.changes if may_read(change.slot)])
+        return notice if len(changes) == len(notice.changes) else replace(notice, changes=changes)
 
     def tell_skipped(self) -> None:
         """Send the numbers of notices skipped a while ago."""

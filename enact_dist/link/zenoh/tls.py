@@ -29,7 +29,7 @@ from enact_dist.wire.texts import shown
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from enact_dist.config.types import SecurityConfig
+    from enact_dist.config.rights import SecurityConfig
 
 KEYS_VARIABLE: Final = "ENACT_KEYS"
 IDENTITY_VARIABLE: Final = "ENACT_IDENTITY"
@@ -252,7 +252,7 @@ def client_keys(security: SecurityConfig, actor: str) -> KeyFiles | None:
     if wanted:
         return KeyFiles(folder, wanted)
     names = sorted(file.stem for file in folder.glob("*.crt"))
-    operators = [name for name in security.operators if name in names]
+    operators = [name for name in security.key_holders if name in names]
     others = [name for name in names if not name.startswith(SHARD_PREFIX)]
     if len(others) > 1 and not operators:
         raise ConfigError(

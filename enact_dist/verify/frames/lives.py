@@ -44,8 +44,8 @@ from enact_dist.core.shard.owners import shard_identity
 from enact_dist.core.shard.shard import Shard
 from enact_dist.core.shard.state import ShardSettings
 from enact_dist.errors import ProtocolError
-from enact_dist.link.host import open_host
 from enact_dist.link.memory.shared_folder import SharedFolder
+from enact_dist.link.opening import open_host
 from enact_dist.verify.frames.hostile import SESSIONS, Hostile
 from enact_dist.wire.frames import decode_frame, encode_frame
 

@@ -1,0 +1,207 @@
+"""What each request needs, and the refusal of a request that lacks it.
+
+=======================================  =======================================================
+request                                  right
+=======================================  =======================================================
+`Acquire`, `TakeView`                    `read` or `write` of each item, by its access
+`Fetch`                                  none for what a lock of the session pins, else `read`
+`Commit`, `Prepare`                      of each slot `change`, `init` or `delete`, by what is there
+`Stage`                                  any of these on anything
+`Register`                               `write` somewhere of each aspect; `register` of new worlds
+`Fork`, `DropWorld`, `KeepVersions`      `fork` and `read` of the whole source; `drop`; `keep`
+`Break`; `ForceAbort`, settled alarms    `break`; `resolve`
+`Survey`, `ListHistory`, `Explain`,      `observe`; what is not readable is left out
+`FindEffects`
+`ListLocks`, `ListSessions`,             `observe`
+`ListAudit`
+=======================================  =======================================================
+
+Everything else needs none: the owner of a session may renew, release and end, and shards are known
+by their own identity (`enact_dist.core.shard.owners`).  Locks are refused before they get a place
+in the queue.  A commit is compared again behind its fence, since a client may send anything.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, Protocol
+
+from enact_dist.core.protocol.datum import Slot
+from enact_dist.core.protocol.messages import (
+    Acquire,
+    Break,
+    DropWorld,
+    Explain,
+    FindEffects,
+    ForceAbort,
+    Fork,
+    KeepVersions,
+    ListAudit,
+    ListHistory,
+    ListLocks,
+    ListSessions,
+    Refused,
+    Register,
+    Stage,
+    Survey,
+    TakeView,
+)
+from enact_dist.core.protocol.records import Story
+from enact_dist.core.rights.rules import ALL, DENIED, UNPROVEN, WRITE, path_of
+from enact_dist.terms import ACCESSES
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Iterable, Iterator
+
+    from enact_dist.core.protocol.messages import Item, WriteItem
+    from enact_dist.core.protocol.records import Content
+    from enact_dist.core.rights.rules import Rights
+
+TOLD_EACH_NS: Final = 1_000_000_000
+"""The log names a subject and a right at most once in this time."""
+TOLD_MAX: Final = 1_000
+"""Subjects and rights that are remembered for that; with one more, all of them are forgotten."""
+_OBSERVING: Final = frozenset(
+    (Survey, ListLocks, ListSessions, ListHistory, Explain, FindEffects, ListAudit)
+)
+
+
+class SlotContents(Protocol):
+    """What each slot has, null included."""
+
+    def __getitem__(self, slot: Slot, /) -> Content: ...
+
+
+class Guard:
+    """Compares the requests of one shard with the rights of their subjects.
+
+    Attributes:
+        rights: The rights; they may be replaced between two messages.
+        subject: Whose rights the present request uses.
+        asker: The identity under which it came.
+        denials: Refusals of the present request that the log does not name yet.
+    """
+
+    __slots__ = ("_count", "_told", "asker", "denials", "rights", "subject")
+
+    def __init__(self, rights: Rights, count: Callable[[str], None]) -> None:
+        self.rights = rights
+        self.subject = self.asker = ""
+        self.denials: list[tuple[str, str, Refused]] = []
+        self._count = count
+        self._told: dict[tuple[str, str], tuple[int, int]] = {}
+
+    def begin(self, asker: str, subject: str | None) -> None:
+        """Note who sends the next message; None: the transport vouches for no name."""
+        self.asker = asker
+        self.subject = (UNPROVEN if asker else "") if subject is None else subject
+
+    # ---------------------------------------------------------------- requests
+
+    def refusal(self, message: object, worlds: Collection[str]) -> Refused | None:
+        """Return why the present subject may not ask that, else None.
+
+        Args:
+            message: A request, or an event of the host, which needs no right.
+            worlds: The world contexts that exist.
+        """
+        kind = type(message)
+        if isinstance(message, Acquire | TakeView):
+            return self._items(message.items)
+        if isinstance(message, Register):
+            return self._register(message, worlds)
+        if isinstance(message, Fork):
+            return self._fork(message)
+        if isinstance(message, DropWorld):
+            return self._plain("drop", message.world, message.world)
+        if isinstance(message, KeepVersions):
+            return self._plain("keep", message.label, message.label)
+        if kind is Break:
+            return self._plain("break", ALL, "locks")
+        if kind is ForceAbort or (isinstance(message, ListAudit) and message.settle):
+            return self._plain("resolve", ALL, "locks and alarms")
+        if kind is Stage and not self.rights.may_write_some(self.subject, ALL):
+            return self.denied(WRITE, "anything")
+        return self._plain("observe", ALL, "the cell") if kind in _OBSERVING else None
+
+    def _plain(self, right: str, path: str, what: str) -> Refused | None:
+        may = self.rights.may(self.subject, right, path)
+        return None if may else self.denied(right, what)
+
+    def _items(self, items: Iterable[Item]) -> Refused | None:
+        rights, subject = self.rights, self.subject
+        for item in items:
+            access = ACCESSES.get(item.access)
+            right = WRITE if access is not None and access.writes else "read"
+            if not rights.may(subject, right, f"{item.context}/{item.aspect}/{item.entity}"):
+                return self.denied(right, shown(Slot(item.context, item.entity, item.aspect)))
+        return None
+
+    def _register(self, message: Register, worlds: Collection[str]) -> Refused | None:
+        for entry in message.aspects:
+            if not self.rights.may_write_some(self.subject, f"*/{entry.name}/{ALL}"):
+                return self.denied(WRITE, f"aspect {entry.name}")
+        for world in message.worlds:
+            if world not in worlds and not self.rights.may(self.subject, "register", world):
+                return self.denied("register", world)
+        return None
+
+    def _fork(self, message: Fork) -> Refused | None:
+        source, world = message.source, message.world
+        return self._plain("fork", f"{source}/{world}", f"{source} -> {world}") or self._plain(
+            "read", f"{source}/*/{ALL}", f"{source}:{ALL}"
+        )
+
+    # ---------------------------------------------------------------- slots
+
+    def hides(self, slot: Slot) -> bool:
+        """Whether the present subject may not read a slot."""
+        return not self.rights.may(self.subject, "read", path_of(slot))
+
+    def may_not_read(self, slot: Slot) -> Refused | None:
+        """Refuse a slot that the present subject may not read."""
+        return self.denied("read", shown(slot)) if self.hides(slot) else None
+
+    def may_not_write(self, writes: Iterable[WriteItem], contents: SlotContents) -> Refused | None:
+        """Refuse writes for which the present subject has not the right.
+
+        Args:
+            writes: What it writes.
+            contents: What the slots have now.
+        """
+        for slot, datum in writes:
+            right = "delete" if datum is None else "change"
+            if datum is not None and contents[slot].datum is None:
+                right = "init"
+            if not self.rights.may(self.subject, right, path_of(slot)):
+                return self.denied(right, shown(slot))
+        return None
+
+    # ---------------------------------------------------------------- people
+
+    def denied(self, right: str, what: str) -> Refused:
+        """Refuse a right on something, and count it."""
+        self._count("permission_denied")
+        refused = self.rights.refuse(self.subject, self.asker, right, what)
+        self.denials.append((self.subject, right, refused))
+        return refused
+
+    def stories(self, now_ns: int) -> Iterator[Story]:
+        """Yield what the log is to say: one line for each subject, right and second."""
+        for subject, right, refused in self.denials:
+            key = (subject, right)
+            told_ns, left_out = self._told.get(key, (now_ns - TOLD_EACH_NS, 0))
+            if now_ns - told_ns < TOLD_EACH_NS:
+                self._told[key] = told_ns, left_out + 1
+                continue
+            if len(self._told) >= TOLD_MAX:
+                self._told.clear()
+            self._told[key] = now_ns, 0
+            more = f"; {left_out} more since the last line" if left_out else ""
+            asker = f" (asked by {self.asker})" if refused.code == DENIED and self.asker else ""
+            yield Story("permission.denied", f"{refused.text}{asker}{more}")
+        self.denials.clear()
+
+
+def shown(slot: Slot) -> str:
+    """Return a slot as rules and refusals name it."""
+    return f"{slot.context}:{slot.entity}/{slot.aspect}"

@@ -1,0 +1,129 @@
+"""Rights at a real shard: over its socket by user and name, and none over Zenoh."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+
+import pytest
+from ports import free_endpoint
+
+from enact_dist import Aspect, Durability, Entities, Entity, Lock, View, Write, connect
+from enact_dist.config.read import load_config
+from enact_dist.errors import LinkError, PermissionDeniedError
+from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
+from enact_dist.link.socket.peers import PeerCredentials
+
+pytestmark = pytest.mark.carrier("auto")
+
+COUNT = Aspect("count", int, Durability.VOLATILE)
+CELL = """\
+name = "guarded"
+worlds = ["online"]
+carrier = "socket"
+[shards.s]
+listen = "{endpoint}"
+[security]
+operators = ["ada"]
+[rights]
+programs = ["camera", "logger"]
+uids = {{ 1001 = "camera", 1002 = "@cams" }}
+[rights.groups]
+cams = ["camera"]
+[[rights.allow]]
+who = "camera"
+read = "online:view/*/count"
+write = "online:view/*/count"
+[[rights.allow]]
+who = ["logger"]
+read = "online:**"
+"""
+
+
+@contextmanager
+def guarded(tmp_path):
+    """Yield a running shard with rights, and its cell.toml."""
+    file = tmp_path / "cell.toml"
+    file.write_text(CELL.format(endpoint=free_endpoint()), "utf-8")
+    config = load_config(file, environment={})
+    shard = start_shard(
+        DaemonSettings(
+            config.name, config.shard_settings("s"), config.shard("s").listen, carrier="socket"
+        )
+    )
+    try:
+        yield shard, file
+    finally:
+        shard.stop(drain_s=0.0)
+
+
+def put(cell, entity, value):
+    request = Write(cell.world("online"), Entity(entity), COUNT)
+    with Lock(request) as lock:
+        lock[request] = value
+
+
+def test_names_of_one_user_have_their_rights_over_the_socket(tmp_path):
+    with guarded(tmp_path) as (shard, file):
+        with connect(file, actor="camera") as camera:
+            put(camera, "view/1", 1)
+            with pytest.raises(PermissionDeniedError) as caught:
+                put(camera, "plan/1", 1)
+            error = caught.value
+            assert (error.identity, error.right) == ("camera", "write")
+            assert (error.world, error.entity, error.aspect) == ("online", "plan/1", "count")
+            assert error.rule == "[rights] of cell.toml"
+        with connect(file, actor="logger") as logger:
+            seen = View(logger.world("online"), Entity("view/1"), COUNT)
+            with Lock(seen) as lock:
+                assert lock[seen] == 1
+            with pytest.raises(PermissionDeniedError, match="logger may not write"):
+                put(logger, "view/1", 2)
+        with connect(file, actor="ada") as ada:
+            put(ada, "plan/1", 1)
+        with connect(file, actor="joe") as joe:
+            seen = View(joe.world("online"), Entity("view/1"), COUNT)
+            with pytest.raises(PermissionDeniedError, match="joe may not read"), Lock(seen):
+                pass
+        assert shard.host.figures()["permission_denied"] >= 3
+
+
+def test_a_name_over_zenoh_is_no_proof(tmp_path, monkeypatch):
+    """It is refused by an error after which an actor tries again."""
+    with guarded(tmp_path) as (_, file):
+        plain = file.with_name("plain.toml")
+        text = file.read_text("utf-8").partition("[security]")[0]
+        plain.write_text(text.replace('"socket"', '"zenoh"'), "utf-8")
+        with (
+            connect(plain, actor="ada") as ada,
+            pytest.raises(LinkError, match="over Zenoh, where its name is only its own word"),
+        ):
+            put(ada, "view/1", 1)
+
+
+def test_a_watch_over_the_socket_leaves_out_what_is_not_readable(tmp_path):
+    """Also where a commit changes both; the numbers of its notices have no gap."""
+    with (
+        guarded(tmp_path) as (_, file),
+        connect(file, actor="camera") as camera,
+        connect(file, actor="ada") as ada,
+        camera.world("online").watch(Entities("**"), COUNT) as watch,
+    ):
+        put(ada, "secret", 1)
+        both = [Write(ada.world("online"), Entity(name), COUNT) for name in ("secret", "view/1")]
+        with Lock(*both) as lock:
+            for request in both:
+                lock[request] = 2
+        put(ada, "view/1", 3)
+        changes = [watch.next(5.0) for _ in range(2)]
+        assert {change.entity.name for change in changes} == {"view/1"}
+        assert watch.next(0.2) is None
+
+
+def test_a_user_without_an_entry_is_refused_by_number(tmp_path):
+    with guarded(tmp_path) as (shard, _):
+        subject_of = shard._sockets._subject_of
+        assert subject_of("joe@h:1", PeerCredentials(7, 1001, 1)) == "camera"
+        assert subject_of("joe@h:1", PeerCredentials(7, 1002, 1)) == "@cams"
+        assert subject_of("a%20b@h:1", PeerCredentials(7, 0, 0)) == "a b"
+        with pytest.raises(LinkError, match="user 1003 of process 7 has no rights at shard s"):
+            subject_of("camera@h:1", PeerCredentials(7, 1003, 1))
