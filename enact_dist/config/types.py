@@ -297,6 +297,12 @@ class CellConfig:
         return tuple(actor.name for actor in self.actors)
 
     @property
+    def key_holders(self) -> tuple[str, ...]:
+        """Who has a key in a cell with keys, beside the shards: actors, operators, programs."""
+        programs = self.rights.programs if self.rights is not None else ()
+        return tuple(dict.fromkeys((*self.actor_names, *self.security.key_holders, *programs)))
+
+    @property
     def ttl_ns(self) -> int:
         """Session TTL in nanoseconds."""
         return round(self.ttl_s * 1e9)

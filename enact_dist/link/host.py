@@ -253,6 +253,11 @@ class ShardHost:
         guard = self._shard.state.guard
         return guard.rights if guard is not None else None
 
+    def take_rights(self, rights: Rights) -> None:
+        """Replace the rights from the next message on; see `Shard.take_rights`."""
+        with self._mutex:
+            self._shard.take_rights(rights)
+
     def owner_of(self, session: str) -> str:
         """Return the identity of a session; "" if unknown.  Takes no mutex."""
         return self._shard.state.sessions.owner(session) or ""

@@ -23,6 +23,13 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from enact_dist.core.shard.owners import shard_identity
 from enact_dist.errors import ConfigError, MisuseError
 from enact_dist.link.folder.lock import replace_file
+from enact_dist.link.zenoh.access import (
+    REVOKED_FILE,
+    common_name,
+    read_revoked,
+    split_common_name,
+    text_of_revoked,
+)
 from enact_dist.link.zenoh.endpoints import split_endpoint
 from enact_dist.link.zenoh.tls import (
     AUTHORITY,
@@ -44,6 +51,8 @@ if TYPE_CHECKING:
 AUTHORITY_DAYS: Final = 3650
 SHARD_DAYS: Final = 730
 CLIENT_DAYS: Final = 365
+NAME_MAX: Final = 60
+"""X.509 has room for 64 characters of a name, of which `~N` takes some once keys were revoked."""
 EARLIER: Final = dt.timedelta(minutes=5)
 """Certificates are valid from a little before they are made: clocks differ."""
 _FILE_MODE, _FOLDER_MODE = 0o600, 0o700
@@ -58,10 +67,12 @@ class KeyOwner:
     Attributes:
         name: `shard.left`, or the name of an actor or operator.
         hosts: Where it serves; a client has none.
+        revoked: How often its keys were revoked.
     """
 
     name: str
     hosts: tuple[str, ...] = ()
+    revoked: int = 0
 
     @property
     def is_shard(self) -> bool:
@@ -73,20 +84,26 @@ def owners_of(config: CellConfig) -> tuple[KeyOwner, ...]:
     """Return the shards, actors and operators of a cell, in the order of its file.
 
     Raises:
-        ConfigError: An actor or operator has a name that is kept for shards.
+        ConfigError: An actor or operator has a name that is too long or kept for shards, or the
+            list of revoked keys cannot be used.
     """
+    revoked = read_revoked(config.security.keys) if config.security.keys is not None else {}
     shards = [
         KeyOwner(shard_identity(one.name), _hosts_of((*one.listen, *one.advertise)))
         for one in config.shards
     ]
-    names = [*(actor.name for actor in config.actors), *config.security.key_holders]
-    for name in names:
+    for name in config.key_holders:
         if name.startswith(SHARD_PREFIX) or f"{name}.pem" == AUTHORITY:
             raise ConfigError(
                 f"{config.path}: {name!r} cannot have a key: 'ca' and names that begin with"
                 f" {SHARD_PREFIX!r} belong to the authority and to shards; choose another name"
             )
-    return (*shards, *(KeyOwner(name) for name in dict.fromkeys(names)))
+        if len(name) > NAME_MAX:
+            raise ConfigError(
+                f"{config.path}: {name!r} cannot have a key: a certificate has room for"
+                f" {NAME_MAX} characters of a name; choose a shorter one"
+            )
+    return (*shards, *(KeyOwner(name, revoked=revoked.get(name, 0)) for name in config.key_holders))
 
 
 def _hosts_of(endpoints: Iterable[str]) -> tuple[str, ...]:
@@ -141,7 +158,9 @@ class Authority:
         if owner.is_shard:
             uses.insert(0, ExtendedKeyUsageOID.SERVER_AUTH)
         end = min(begin + lasts, self.certificate.not_valid_after_utc)
-        draft = _draft(owner.name, self.certificate.subject, key, begin, end)
+        draft = _draft(
+            common_name(owner.name, owner.revoked), self.certificate.subject, key, begin, end
+        )
         ours = self.certificate.extensions.get_extension_for_class(x509.SubjectKeyIdentifier).value
         made_by = x509.AuthorityKeyIdentifier.from_issuer_subject_key_identifier(ours)
         draft = draft.add_extension(made_by, critical=False)
@@ -235,7 +254,8 @@ def read_certificate(file: Path) -> Certificate:
     except x509.ExtensionNotFound:
         pass
     times = found.not_valid_before_utc.timestamp(), found.not_valid_after_utc.timestamp()
-    return Certificate(str(names[0].value) if names else "", hosts, *times)
+    name, revoked = split_common_name(str(names[0].value) if names else "")
+    return Certificate(name, hosts, *times, revoked)
 
 
 @dataclass(frozen=True, slots=True)
@@ -277,6 +297,8 @@ def key_states(folder: Path, owners: Iterable[KeyOwner], *, others: bool = False
 def _problem(found: Certificate, owner: KeyOwner, files: KeyFiles) -> str:
     """Return what should be done about a certificate."""
     now_s = time.time()
+    if found.revoked < owner.revoked:
+        return "revoked: renew it, or delete it"
     if problem := found.problem(now_s):
         return problem
     if missing := hosts_missing(found, owner.hosts):
@@ -287,6 +309,26 @@ def _problem(found: Certificate, owner: KeyOwner, files: KeyFiles) -> str:
         return str(error)
     days = (found.ends_s - now_s) / DAY_S
     return f"ends in {days:.0f} days: renew it" if days < RENEW_DAYS else ""
+
+
+def revoke(folder: Path, owners: Iterable[KeyOwner]) -> Path:
+    """Note that all keys so far of these owners are worth nothing; return the list's path.
+
+    Raises:
+        ConfigError: One is a shard, or the list cannot be used.
+    """
+    revoked = read_revoked(folder)
+    for owner in owners:
+        if owner.is_shard:
+            raise ConfigError(
+                f"the key of {owner.name} cannot be revoked: clients compare a shard's name by"
+                " themselves, with no list; replace the authority (docs/security.md)"
+            )
+        revoked[owner.name] = revoked.get(owner.name, 0) + 1
+    make_folder(folder)
+    file = folder / REVOKED_FILE
+    replace_file(file, text_of_revoked(revoked).encode(), mode=_FILE_MODE)
+    return file
 
 
 def authority_folder(folder: Path, named: Path | None) -> Path:

@@ -22,7 +22,7 @@ from __future__ import annotations
 import re
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final, NamedTuple
-from urllib.parse import quote
+from urllib.parse import quote, unquote
 
 from enact_dist.errors import ProtocolError
 from enact_dist.terms import checked_name
@@ -34,6 +34,8 @@ ROOT: Final = "enact"
 ANY: Final = "*"
 NOBODY: Final = "-"
 """Represents the absence of an identity; no name starts with a hyphen."""
+SAME_NAME: Final = "@$*"
+"""Behind a name in the key of an access rule: whatever its host and process."""
 SHOWN_CHARACTERS: Final = 64
 """So much of an actor's and a host's name goes into an identity."""
 KEY_CHARACTERS_MAX: Final = 4096
@@ -61,8 +63,18 @@ def identity_of(actor: str, host: str, pid: int) -> str:
     The process is a part of it: what one process may take of a shard is bounded, and two hundred
     processes of one name must not share one bound.
     """
-    names = (quote(name[:SHOWN_CHARACTERS], safe="") for name in (actor or NAMELESS, host or "-"))
-    return f"{'@'.join(names)}:{pid}"
+    return f"{quoted_name(actor or NAMELESS)}@{quoted_name(host or NOBODY)}:{pid}"
+
+
+def quoted_name(name: str) -> str:
+    """Return a name as it stands in an identity: without an ``@`` that would end it."""
+    return quote(name[:SHOWN_CHARACTERS], safe="")
+
+
+@lru_cache(maxsize=1024)
+def name_in(identity: str) -> str:
+    """Return the name in an identity: the actor that `identity_of` got, or that of a shard."""
+    return unquote(identity.partition("@")[0])
 
 
 @lru_cache(maxsize=1024)

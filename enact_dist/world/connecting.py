@@ -62,6 +62,7 @@ def connect(
             has been connected (see `Cell`).
     """
     from enact_dist.link.client.joining import join
+    from enact_dist.link.zenoh.access import actor_said
     from enact_dist.link.zenoh.config import OPEN_S
     from enact_dist.link.zenoh.tls import client_keys
 
@@ -73,6 +74,9 @@ def connect(
         check_seconds(word, waits_s)
     known = _known_of(target)
     client = _client(actor, ttl_s=known.ttl_s, observer=observer)
+    keys = client_keys(known.security, client.actor)
+    if keys is not None:
+        client.actor = actor_said(keys.name, client.actor)
     cell_name, cell_client, welcome = join(
         known.name,
         known.endpoints,
@@ -81,7 +85,7 @@ def connect(
         open_s=min(OPEN_S, request_timeout_s),
         carrier=known.carrier,
         expected=known.expected,
-        keys=client_keys(known.security, client.actor),
+        keys=keys,
     )
     cell_client.request_timeout_s = request_timeout_s
     try:

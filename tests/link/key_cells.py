@@ -76,6 +76,7 @@ class KeyCell:
             "link_lease_s": config.ttl_s / 2,
             "carrier": config.carrier,
             "keys": shard_keys(config.security, shard),
+            "names": config.key_holders,
         }
         return DaemonSettings(**{**said, **options})
 

@@ -139,7 +139,8 @@ def test_rules_belong_to_a_listening_session_only(endpoint):
     allowed = {rule["id"]: rule["key_exprs"] for rule in rules}
 
     assert allowed == {
-        "requests": ["enact/cell/s0/*/*", "enact/*/*/ping/*", "enact/*/*/await_stamp/*"],
+        "ask": ["enact/*/*/ping/*", "enact/*/*/await_stamp/*"],
+        "requests": ["enact/cell/s0/*/*"],
         "tokens": ["enact/cell/@sessions/*/*"],
         "watch": ["enact/cell/@notices/*"],
         "answers": ["enact/cell/s0/**", "enact/*/*/ping/*", "enact/*/*/await_stamp/*"],

@@ -14,6 +14,7 @@ _AUTHORITY: Final = file_of(
 _NAMES: Final = option(
     "names", "NAME", "shard.NAME, or the name of an actor or operator", nargs="*"
 )
+_REVOKED: Final = option("names", "NAME", "the name of an actor, operator or program", nargs="+")
 
 VERBS: Final = (
     Verb(
@@ -43,5 +44,12 @@ VERBS: Final = (
         "keys:renew",
         "enact cell keys renew\nenact cell keys renew shard.left",
         (_NAMES, _AUTHORITY, CELL_FILE, JSON),
+    ),
+    Verb(
+        "keys revoke",
+        "bar all keys so far of the named actors, operators and programs, once shards reload",
+        "keys:revoke",
+        "enact cell keys revoke camera",
+        (_REVOKED, CELL_FILE, JSON),
     ),
 )  # fmt: skip

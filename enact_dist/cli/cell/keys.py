@@ -1,4 +1,4 @@
-"""`enact cell keys init|make|ls|renew`: the keys of a cell, on the host that makes them."""
+"""`enact cell keys init|make|ls|renew|revoke`: the keys of a cell, on the host that makes them."""
 
 from __future__ import annotations
 
@@ -59,6 +59,22 @@ def renew(options: argparse.Namespace) -> Output:
     states = key_states(folder, _chosen(config, options.names))
     due = [one for one in states if options.names or (one.certificate and one.problem)]
     return _made(due, folder, options, nothing="no key is due; name one to renew it all the same")
+
+
+def revoke(options: argparse.Namespace) -> Output:
+    """Bar all keys so far of some names."""
+    config, folder = _cell(options)
+    from enact_dist.operate.keys import revoke as note
+
+    file = note(folder, _chosen(config, options.names))
+    names = ", ".join(options.names)
+    text = (
+        f"the keys so far of {names} are on the list {file}\n"
+        "next: copy the list to the key folder of each shard's host, and there: enact shard reload"
+        " --all\n"
+        f"for new keys: enact cell keys renew {' '.join(options.names)}"
+    )
+    return Output({"revoked": options.names, "list": file}, text)
 
 
 def list_keys(options: argparse.Namespace) -> Output:

@@ -41,13 +41,14 @@ def run_shard(options: argparse.Namespace) -> int:
     ):
         if found:
             environment[variable_of(options.name, key)] = found
-    # The name comes first: an override for a shard that is not there would blame the override.
-    written = load_config(target).shard(options.name)
-    config = load_config(target, environment=environment)
-    shard = config.shard(options.name)
-    drain_s = shard.drain_s if options.drain_s is None else options.drain_s
-    return shard_daemon.run_shard(
-        shard_daemon.DaemonSettings(
+
+    def settings() -> shard_daemon.DaemonSettings:
+        # The name comes first: an override for a shard that is not there would blame the override.
+        written = load_config(target).shard(options.name)
+        config = load_config(target, environment=environment)
+        shard = config.shard(options.name)
+        drain_s = shard.drain_s if options.drain_s is None else options.drain_s
+        return shard_daemon.DaemonSettings(
             cell=config.name,
             shard=config.shard_settings(shard.name),
             listen=shard.listen,
@@ -59,9 +60,12 @@ def run_shard(options: argparse.Namespace) -> int:
             metrics=shard.metrics,
             written=written.advertise,
             keys=shard_keys(config.security, shard.name),
+            names=config.key_holders,
+            again=settings,
             drain_s=shard_daemon.DRAIN_S if drain_s is None else drain_s,
         )
-    )
+
+    return shard_daemon.run_shard(settings())
 
 
 def list_shards(options: argparse.Namespace) -> Output:

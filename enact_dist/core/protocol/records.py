@@ -428,6 +428,13 @@ class SessionDied:
 
 
 @message
+class SessionBarred:
+    """The name of a session may not use this shard any more, as the transport enforces."""
+
+    session: str
+
+
+@message
 class Tick:
     """Time has passed; the inbox was empty."""
 
@@ -451,6 +458,7 @@ Event = (
     | Served
     | SessionSeen
     | SessionDied
+    | SessionBarred
     | Tick
     | Drain
     | MakeRoom

@@ -27,6 +27,7 @@ from enact_dist.core.protocol.records import (
     Persist,
     Record,
     Reply,
+    SessionBarred,
     SessionDied,
     SessionEnded,
     SessionRecord,
@@ -252,6 +253,14 @@ class SessionDesk:
             who = f"{found.actor or 'client'}@{found.host} pid {found.pid}"
             yield Story("session.died", f"the process of {who} ended, session {found.session}")
             yield from self.end(message.session, "its process died")
+
+    def on_session_barred(self, message: SessionBarred, _: int) -> Iterator[Effect]:
+        """End a session whose name is none of the cell any more."""
+        found = self._state.sessions.by_id.get(message.session)
+        if found is not None:
+            self._state.count("sessions_barred")
+            yield Story("session.barred", f"{found.identity} is barred, session {found.session}")
+            yield from self.end(message.session, "its name may not use this shard any more")
 
     def end(self, session: str, cause: str) -> Iterator[Effect]:
         """End a session: free its locks, forget its pins, keep its outcomes."""

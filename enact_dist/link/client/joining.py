@@ -65,7 +65,7 @@ def join(
     # The link's lease follows the session's, and the shard may have shortened that.
     client.ttl_ns = min(client.ttl_ns, welcome.ttl_ns)
     reachable = [e for entry in welcome.placement.shards for e in entry.endpoints]
-    identity = identity_of(client.actor, client.host, client.pid)
+    identity = identity_of(keys.name if keys else client.actor, client.host, client.pid)
     zenoh = ZenohCarrier(
         found,
         client.session,

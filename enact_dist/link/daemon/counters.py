@@ -106,6 +106,7 @@ OF_A_SHARD: Final[dict[str, Figure]] = {
         "locks held longer than hold_s", "raise hold_s, or do less under the lock"
     ),
     "sessions_died": Figure("clients whose process died without closing its session", _DYING),
+    "sessions_barred": Figure("sessions ended because a reload no longer allows their name"),
     "waiters_dropped": Figure(
         "waiting locks dropped because their client was gone or silent", _DYING
     ),
@@ -160,6 +161,10 @@ OF_A_SHARD: Final[dict[str, Figure]] = {
     "permission_denied": Figure(
         "requests refused because the rights of the cell do not allow them",
         "the shard's log names sender and right; see [rights] in cell.toml",
+    ),
+    "reloads": Figure("times that the shard took keys, names and rights anew"),
+    "reloads_refused": Figure(
+        "times that it could not, and kept the old ones", "the shard's log names the reason"
     ),
     "sessions_displaced": Figure(
         "idle sessions ended to make room in a full table",

@@ -22,7 +22,7 @@ from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.messages import ListLocks, Locks
-from enact_dist.core.protocol.records import Called, SessionSeen, ShardReturned
+from enact_dist.core.protocol.records import Called, SessionBarred, SessionSeen, ShardReturned
 from enact_dist.errors import ConfigError, EnactError, LinkError
 from enact_dist.link.client.calls import Calls
 from enact_dist.link.client.duplicate_daemons import (
@@ -32,7 +32,7 @@ from enact_dist.link.client.duplicate_daemons import (
     serving,
     two_daemons,
 )
-from enact_dist.link.daemon.key_watch import KeyWatch, checked_keys
+from enact_dist.link.daemon.reload import Reload, checked_keys
 from enact_dist.link.daemon.service_manager import ServiceManager
 from enact_dist.link.daemon.shard_calls import ShardCalls
 from enact_dist.link.log import READY, JsonLines, Log, TextLines, say
@@ -40,13 +40,15 @@ from enact_dist.link.memory.shared_folder import SharedFolder
 from enact_dist.link.opening import open_host
 from enact_dist.link.signals import StopSignals
 from enact_dist.link.socket.service import SocketService
+from enact_dist.link.zenoh.access import common_name, read_revoked
 from enact_dist.link.zenoh.config import close_session, listening_settings, open_session, to_reach
 from enact_dist.link.zenoh.discovery import FoundShard, find_shards
 from enact_dist.link.zenoh.endpoints import somebody_listens, split_endpoint
 from enact_dist.link.zenoh.service import ZenohService
+from enact_dist.wire.keys import name_in
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Container, Mapping
     from pathlib import Path
 
     import zenoh
@@ -93,6 +95,8 @@ class DaemonSettings:
         metrics: Host and port for Prometheus, see `link.daemon.metrics`; None: no server.
         written: The shard's endpoints in `cell.toml`, even if this start overrides them.
         keys: The files by which the shard proves its name, in a cell with keys.
+        names: Names of clients that have a key.
+        again: Reads the settings anew; a reload takes keys, names and rights from them.
     """
 
     cell: str
@@ -107,6 +111,20 @@ class DaemonSettings:
     metrics: tuple[str, int] | None = None
     written: tuple[str, ...] = ()
     keys: KeyFiles | None = None
+    names: tuple[str, ...] = ()
+    again: Callable[[], DaemonSettings] | None = None
+
+    @property
+    def common_names(self) -> dict[str, str] | None:
+        """The common names of the clients' certificates by their names; None without keys.
+
+        Raises:
+            ConfigError: The list of revoked keys cannot be used.
+        """
+        if self.keys is None:
+            return None
+        revoked = read_revoked(self.keys.folder)
+        return {name: common_name(name, revoked.get(name, 0)) for name in self.names}
 
     @property
     def hosts(self) -> tuple[str, ...]:
@@ -152,6 +170,7 @@ class RunningShard:
             if settings.metrics is not None:
                 self._metrics = _metrics_server(settings, self.host)
                 undo.callback(self._metrics.close)
+            self._names = settings.common_names
             self._session = self._open_session()
             undo.callback(close_session, self._session)
             self._calls = ShardCalls(
@@ -167,14 +186,13 @@ class RunningShard:
             self._comparing = Comparing(settings.cell, self.host.event, settings.keys)
             undo.callback(self._comparing.close)
             self.host.call_with(self._calls.submit, self._comparing.submit)
-            self._service = ZenohService(self.host, self._session, settings.cell)
+            self._service = self._served()
             for other in self._calls.others:  # the first tick's requests to them were not sent
                 self.host.event(ShardReturned(other))
             undo.callback(self._service.close)
-            self.keys: KeyWatch | None = None
-            if settings.keys is not None:
-                certificate = checked_keys(settings.keys, ())
-                self.keys = KeyWatch(settings.keys, certificate, self._take_keys)
+            self.reload: Reload | None = None
+            if settings.keys is not None or settings.shard.rights is not None:
+                self.reload = Reload(self._take_again, self.host.count, settings.keys)
             undo.pop_all()
 
     def _open_session(self) -> zenoh.Session:
@@ -183,37 +201,86 @@ class RunningShard:
             listen=settings.listen,
             lease_s=settings.link_lease_s,
             keys=settings.keys,
-            more=listening_settings(settings.cell, settings.shard.name),
+            more=listening_settings(
+                settings.cell,
+                settings.shard.name,
+                self._names,
+                [entry.name for entry in settings.shard.placement.shards],
+            ),
         )
 
-    def _take_keys(self) -> Certificate:
-        """Serve with the key files as they are now; clients connect again, sessions and locks stay.
+    def _served(self) -> ZenohService:
+        proven = self._names is not None
+        return ZenohService(self.host, self._session, self.settings.cell, proven=proven)
+
+    def _take_again(self) -> Certificate | None:
+        """Serve with keys, names and rights as they are now; return the certificate, if any.
+
+        Clients connect again; sessions and locks stay, except for those of names that are barred.
 
         Raises:
-            EnactError: The files cannot be used; nothing has changed.
+            EnactError: They cannot be used; nothing has changed.
         """
-        keys = self.settings.keys
-        assert keys is not None
+        settings = self._read_again()
+        keys, rights = settings.keys, settings.shard.rights
         with self._stopping:
-            certificate = checked_keys(keys, self.settings.hosts)
+            certificate = checked_keys(keys, settings.hosts) if keys is not None else None
+            names = settings.common_names
             if self._stopped:
                 return certificate
-            before = self._service
-            before.close()
-            close_session(self._session)
-            try:
-                self._session = self._reopened()
-                self._service = ZenohService(self.host, self._session, self.settings.cell)
-            except Exception as error:
-                _log.critical("shard %s cannot listen again: %s", self.settings.shard.name, error)
-                self._failure = error
-                self._ended.set()
-                raise
+            barred = {
+                name
+                for name, proof in (self._names or {}).items()
+                if names is not None and names.get(name) != proof
+            }
+            self.settings, self._names = settings, names
+            if rights is not None:
+                self.host.take_rights(rights)
+                if self._sockets is not None:
+                    self._sockets.take_rights()
+            if keys is not None:
+                self._reopen(barred)
+        return certificate
+
+    def _read_again(self) -> DaemonSettings:
+        """Return the settings with keys, names and rights as their files have them now.
+
+        Raises:
+            ConfigError: They cannot be read, or the shard would have to be started again.
+        """
+        now = self.settings
+        new = now.again() if now.again is not None else now
+        for what, had, has in (
+            ("[security] keys", now.keys, new.keys),
+            ("[rights]", now.shard.rights, new.shard.rights),
+        ):
+            if (had is None) != (has is None):
+                change = "removed" if has is None else "added"
+                raise ConfigError(f"{what} was {change}: that takes a restart of the shard")
+        shard = replace(now.shard, rights=new.shard.rights)
+        return replace(now, shard=shard, names=new.names, keys=new.keys)
+
+    def _reopen(self, barred: Container[str]) -> None:
+        """Open the Zenoh session with the settings of now, and end the sessions of barred names."""
+        before = self._service
+        before.close()
+        close_session(self._session)
+        try:
+            self._session = self._reopened()
+            self._service = self._served()
+        except Exception as error:
+            _log.critical("shard %s cannot listen again: %s", self.settings.shard.name, error)
+            self._failure = error
+            self._ended.set()
+            raise
+        present = dict(before.present)
+        for session in [one for one, identity in present.items() if name_in(identity) in barred]:
+            self.host.event(SessionBarred(session))
+            del present[session]
         grace_s = self.settings.link_lease_s + RECONNECT_S
-        timer = threading.Timer(grace_s, self._report_absent, (dict(before.present),))
+        timer = threading.Timer(grace_s, self._report_absent, (present,))
         timer.daemon = True
         timer.start()
-        return certificate
 
     def _reopened(self) -> zenoh.Session:
         end_s = time.monotonic() + REOPEN_S
@@ -246,8 +313,8 @@ class RunningShard:
 
     def stop(self, *, drain_s: float = DRAIN_S) -> None:
         """Drain, answer parked requests, close connections and store; idempotent."""
-        if self.keys is not None:
-            self.keys.close()
+        if self.reload is not None:
+            self.reload.close()
         with self._stopping:
             if self._stopped:
                 return
@@ -396,8 +463,8 @@ def run_shard(settings: DaemonSettings) -> int:
         try:
             signals.call(lambda word: _stop(shard, word, manager))
             signals.call_again(lambda _: shard.stop_now())
-            if shard.keys is not None:
-                signals.call_at(signal.SIGHUP, shard.keys.reload)
+            if shard.reload is not None:
+                signals.call_at(signal.SIGHUP, shard.reload)
             shard.host.each_tick(lambda: manager.alive(shard.host.state))
             _say_ready(shard, formatter)
             manager.ready(shard.host.state)

@@ -18,7 +18,6 @@ import time
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
-from urllib.parse import unquote
 
 from enact_dist.core.protocol.records import SessionDied
 from enact_dist.core.shard.owners import not_yours
@@ -27,6 +26,7 @@ from enact_dist.link.socket.connection import SocketConnection
 from enact_dist.link.socket.frames import end_socket, prefixed
 from enact_dist.link.socket.peers import Deaths, PeerCredentials, check_peer
 from enact_dist.wire.frames import encode_frame
+from enact_dist.wire.keys import name_in
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -142,6 +142,17 @@ class SocketService:
             raise LinkError(problem)
         self._deaths.connected(session, connection.connected)
 
+    def take_rights(self) -> None:
+        """Let each connection use the rights that the shard has now, or end it."""
+        with self._mutex:
+            present = [one for mine in self._connections.values() for one in mine]
+        for connection in present:
+            try:
+                connection.subject = self._subject_of(connection.identity, connection.peer)
+            except LinkError as error:
+                _log.warning("connection of %s ended: %s", connection.identity, error)
+                connection.end()
+
     def _subject_of(self, identity: str, peer: PeerCredentials) -> str | None:
         """Return whose rights a process uses, by its user; None: the shard has no rights.
 
@@ -151,7 +162,7 @@ class SocketService:
         rights = self.host.rights
         if rights is None:
             return None
-        name = unquote(identity.partition("@")[0])
+        name = name_in(identity)
         subject = rights.subject_of(peer.user, name, trusted=peer.user in self._users)
         if not subject:
             raise LinkError(

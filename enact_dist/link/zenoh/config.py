@@ -16,7 +16,7 @@ not relay between peers).  Reasons for the settings, measured with 1.10 on a loo
   dropped after 50 ms; only dedicated sender threads wait for it.
 - Reconnection after 50 ms, then at increasing intervals up to a second: a shard that restarts
   quickly is back in use after 0.1 s, and an absent one costs its clients nothing.
-- `access_rules`: a listener relays nothing, and silent connections lock no client out.
+- `link.zenoh.access`: a listener relays nothing, and silent connections lock no client out.
 - `link.zenoh.links`: lost connections block no client, and are restored soon.
 
 Sessions must be closed before the interpreter ends (it hangs otherwise), and must never be closed
@@ -36,15 +36,14 @@ from typing import TYPE_CHECKING, Final
 
 import zenoh
 
-from enact_dist.core.protocol.messages import Ping
 from enact_dist.errors import ConfigError, LinkError, MisuseError
 from enact_dist.link.carrier import FORKED_REMEDY
+from enact_dist.link.zenoh.access import access_rules
 from enact_dist.link.zenoh.links import LinkWatch
-from enact_dist.wire.keys import ANY, ROOT, notice_key, queryable_key, token_key, verb_of
 from enact_dist.wire.limits import FRAME_BYTES_MAX
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from enact_dist.link.zenoh.tls import KeyFiles
 
@@ -67,9 +66,6 @@ UNACKNOWLEDGED: Final = 0.75
 """How much of a link's lease a shard's bytes may stay unacknowledged: less than all of it, so
 that the kernel gives up before anything closes the link.
 """
-ALL_PEERS: Final = "all-peers"
-EARLIER_QUESTION: Final = "await_stamp"
-"""Discovery query of releases with frames before 7: the answer names our version."""
 ACCEPT_PENDING: Final = 10_000
 """Connections that may be without a greeting at one time.  Zenoh's limit of 100 would let
 three hundred silent ones lock everybody else out indefinitely.
@@ -149,51 +145,14 @@ def session_config(
     return config
 
 
-def listening_settings(cell: str, shard: str) -> dict[str, object]:
-    """Return the settings of a shard's listening session."""
+def listening_settings(
+    cell: str, shard: str, names: Mapping[str, str] | None = None, shards: Iterable[str] = ()
+) -> dict[str, object]:
+    """Return the settings of a shard's listening session; see `access_rules` for the arguments."""
     return {
-        "access_control": access_rules(cell, shard),
+        "access_control": access_rules(cell, shard, names, shards),
         "transport/unicast/accept_pending": ACCEPT_PENDING,
         "transport/unicast/accept_timeout": round(ACCEPT_S * 1e3),
-    }
-
-
-def access_rules(cell: str, shard: str) -> dict[str, object]:
-    """Return the access rules of a shard's listening session: its own traffic, and nothing else.
-
-    A listening session relays between peers that connect in Zenoh's client or router mode.  Without
-    rules, a stranger's queryable would receive every request of every client, including committed
-    data, and its notices would reach every watcher.  With these rules only the shard answers its
-    requests, publishes its notices and sees tokens.  They cost 15 us a call, need no keys, and
-    check only key expressions; the shard itself checks everything else (see
-    `enact_dist.core.shard.owners`).
-
-    Zenoh drops forbidden messages silently: a query gets no reply, a declaration reaches no peer.
-    A query passes only if its key is *included* in an allowed one, so a query with wildcards for
-    several shards or verbs does not, except for the discovery of shards.
-    """
-    own = queryable_key(cell, shard)
-    requests = f"{own.removesuffix('**')}*/*"
-    anywhere = [f"{ROOT}/{ANY}/{ANY}/{verb}/{ANY}" for verb in (verb_of(Ping()), EARLIER_QUESTION)]
-    tokens = token_key(cell, ANY, ANY)
-    allowed = (
-        ("requests", "ingress", ["query"], [requests, *anywhere]),
-        ("tokens", "ingress", ["liveliness_token"], [tokens]),
-        ("watch", "ingress", ["declare_subscriber"], [notice_key(cell, ANY)]),
-        ("answers", "egress", ["reply", "declare_queryable"], [own, *anywhere]),
-        ("notices", "egress", ["put"], [notice_key(cell, shard)]),
-        ("see", "egress", ["declare_liveliness_subscriber", "liveliness_query"], [tokens]),
-    )
-    rules = [
-        {"id": name, "permission": "allow", "flows": [flow], "messages": kinds, "key_exprs": keys}
-        for name, flow, kinds, keys in allowed
-    ]
-    return {
-        "enabled": True,
-        "default_permission": "deny",
-        "rules": rules,
-        "subjects": [{"id": ALL_PEERS}],
-        "policies": [{"rules": [rule["id"] for rule in rules], "subjects": [ALL_PEERS]}],
     }
 
 

@@ -24,7 +24,7 @@ from enact_dist.link.zenoh.queries import (
     send_query,
     wait_connected,
 )
-from enact_dist.link.zenoh.tls import why_refused
+from enact_dist.link.zenoh.tls import SHARD_PREFIX, why_refused
 from enact_dist.wire.keys import ANY, NAMELESS, identity_of, parse_request_key, request_key, verb_of
 
 if TYPE_CHECKING:
@@ -120,13 +120,15 @@ def ask_shards(
         ProtocolError: An answer cannot be read.
     """
     deadline_s = time.monotonic() + timeout_s
+    is_shard = keys is not None and keys.name.startswith(SHARD_PREFIX)
+    asker = keys.name if keys is not None and is_shard else NAMELESS
     answers: dict[FoundShard, Answer] = {}
     with _probe(endpoints, timeout_s, keys) as probe:
         while (left_s := deadline_s - time.monotonic()) > 0 and len(answers) < len(shards):
             # A hung shard must leave the others time for a second query after they connect.
             wait_s = max(SHORTEST_S, left_s / 2)
             asked = [
-                (shard, probe.replies(_key(shard, message), message, wait_s))
+                (shard, probe.replies(_key(shard, message, asker), message, wait_s))
                 for shard in shards
                 if shard not in answers
             ]
@@ -143,16 +145,17 @@ def _probe(endpoints: Sequence[str], timeout_s: float, keys: KeyFiles | None) ->
     """Open a short session that only looks for shards."""
     session = open_session(connect=endpoints, lease_s=PROBE_LEASE_S, open_s=timeout_s, keys=keys)
     try:
-        yield _Probe(session, ServerNames(session) if keys is not None else None)
+        yield _Probe(session, keys, ServerNames(session) if keys is not None else None)
     finally:
         close_session(session)
 
 
 @dataclass(frozen=True, slots=True)
 class _Probe:
-    """A short session, and what checks the names of those that answer on it."""
+    """A short session, our keys, and what checks the names of those that answer on it."""
 
     session: zenoh.Session
+    keys: KeyFiles | None
     names: ServerNames | None
 
     def find(self, deadline_s: float) -> tuple[FoundShard, ...]:
@@ -170,7 +173,8 @@ class _Probe:
 
     def greet(self, found: FoundShard, hello: Hello, deadline_s: float) -> Answer | None:
         """Say hello to a shard; return its answer."""
-        key = _key(found, hello, identity_of(hello.actor, hello.host, hello.pid))
+        name = self.keys.name if self.keys is not None else hello.actor
+        key = _key(found, hello, identity_of(name, hello.host, hello.pid))
         wait_s = max(SHORTEST_S, deadline_s - time.monotonic())
         sample = next(self.replies(key, hello, wait_s), None)
         return answer_in(sample, found.shard) if sample is not None else None

@@ -7,9 +7,11 @@ decodes a query, lets the host decide and sends the answer itself; `Senders` pas
 of the client only if sending might block.
 
 Here a client is the identity in the keys of its requests.  All clients without a session share one
-turn, so that a crowd of newcomers delays the others by one request.  Unless Zenoh's access rules
-bind identities to certificates, a hostile program gets as many turns as it opens sessions under
-different identities.
+turn, so that a crowd of newcomers delays the others by one request.  A hostile program gets as many
+turns as it opens sessions under different identities.
+
+In a cell with keys, Zenoh's access rules bind the name in an identity to the sender's certificate
+(`link.zenoh.access`).  So a request uses the rights of that name, and a hello must say it.
 
 A query is answered once and then dropped; a query dropped without an answer means *unknown* to the
 client.  An unreadable frame is refused and counted, and has no other effect.
@@ -25,18 +27,20 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import zenoh
 
-from enact_dist.core.protocol.messages import Answer, Fetch, Ping, Refused, Request, Stage
+from enact_dist.core.protocol.messages import Answer, Fetch, Hello, Ping, Refused, Request, Stage
 from enact_dist.core.protocol.records import SessionSeen
-from enact_dist.core.shard.owners import named_session
-from enact_dist.errors import ProtocolError
+from enact_dist.core.shard.owners import PERMISSION, named_session
+from enact_dist.errors import EnactError, PermissionDeniedError, ProtocolError
 from enact_dist.link.answers import encoded, size_of
 from enact_dist.link.memory.maps import recycle_blocks
+from enact_dist.link.zenoh.access import refuse_other_name
 from enact_dist.link.zenoh.config import QUEUED_MAX, keep_after_fork
 from enact_dist.link.zenoh.fairness import Senders, Turns
 from enact_dist.link.zenoh.queries import bytes_of
 from enact_dist.wire.frames import decode_request, encode_frame
 from enact_dist.wire.keys import (
     ANY,
+    name_in,
     notice_key,
     parse_request_key,
     queryable_key,
@@ -78,15 +82,24 @@ JOIN_S: Final = 0.5
 class ZenohService:
     """Serves one shard on a Zenoh session, which it does not close.
 
+    Args:
+        host: The shard.
+        session: Where it listens.
+        cell: Name of the cell.
+        proven: Whether certificates prove the names of clients.
+
     Attributes:
         senders: Sends the answers.
         count: Adds to a counter of the shard.
         present: The sessions whose tokens are there, each with its identity.
     """
 
-    def __init__(self, host: ShardHost, session: zenoh.Session, cell: str) -> None:
+    def __init__(
+        self, host: ShardHost, session: zenoh.Session, cell: str, *, proven: bool = False
+    ) -> None:
         self._host = host
         self._cell = cell
+        self._proven = proven
         self.count = host.count
         self.senders = Senders(host.count)
         self._closed = False
@@ -231,18 +244,21 @@ class ZenohService:
             cell, shard, verb, identity = parse_request_key(key)
             if verb != verb_of(message):
                 raise ProtocolError(f"a {verb_of(message)} arrived on the key of a {verb}")
+            if self._proven and type(message) is Hello:
+                refuse_other_name(message.actor, identity)
             if (ANY in cell or ANY in shard) and type(message) is not Ping:
                 raise ProtocolError(
                     f"a {verb} was sent to several shards at once; only a ping may be"
                 )
         except Exception as error:  # noqa: BLE001 - every query is answered
-            if not isinstance(error, ProtocolError):
+            if not isinstance(error, EnactError):
                 # A bug in the decoder: a client that triggers it must not stop the dispatcher.
                 _log.exception("a frame of %d bytes broke the decoder", len(header or b""))
             self._host.count("frames_refused")
             call = _Call(self, query, key)
             if _answerable(key):
-                call(Refused("protocol", str(error)))
+                denied = isinstance(error, PermissionDeniedError)
+                call(Refused(PERMISSION if denied else "protocol", str(error)))
             else:
                 call.drop()
             return
@@ -277,7 +293,8 @@ class ZenohService:
 
     def _submit(self, message: Request, call: _Call, identity: str) -> None:
         try:
-            self._host.submit(message, call, identity)
+            subject = name_in(identity) if self._proven else None
+            self._host.submit(message, call, identity, subject)
         except Exception:  # noqa: BLE001 - these threads serve all clients
             _log.exception("a %s could not be handled", type(message).__name__)
             call.drop()

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.core.shard.owners import shard_identity
 from enact_dist.errors import ConfigError
+from enact_dist.link.zenoh.access import split_common_name
 from enact_dist.link.zenoh.endpoints import split_endpoint
 from enact_dist.wire.texts import shown
 
@@ -148,12 +149,14 @@ class Certificate:
         hosts: The addresses and host names at which it may serve.
         starts_s: Since when it is valid, Unix time.
         ends_s: Until when it is valid, Unix time.
+        revoked: How often keys of that name had been revoked before.
     """
 
     name: str
     hosts: tuple[str, ...] = ()
     starts_s: float = 0.0
     ends_s: float = 0.0
+    revoked: int = 0
 
     def problem(self, now_s: float) -> str:
         """Return why it is not valid at a time; empty if it is."""
@@ -223,7 +226,8 @@ def certificate_of(said: Mapping[str, Any]) -> Certificate:
     ]
     starts_s, ends_s = times if len(times) == 2 else (0.0, 0.0)
     hosts = tuple(value for _, value in said.get("subjectAltName", ()))
-    return Certificate(names[0] if names else "", hosts, starts_s, ends_s)
+    name, revoked = split_common_name(names[0] if names else "")
+    return Certificate(name, hosts, starts_s, ends_s, revoked)
 
 
 # ---------------------------------------------------------------- whose files

@@ -1,6 +1,6 @@
-"""Keeps a running shard's certificate up to date: when asked, and by itself near its end.
+"""Lets a running shard take keys, names and rights anew: when asked, and near its key's end.
 
-Zenoh reads the files of a listener only when it opens.  So new files are taken by closing and
+Zenoh reads the files and rules of a listener only when it opens.  So these are taken by closing and
 opening the shard's Zenoh session, for which its clients wait 60 ms; sessions and locks stay.
 """
 
@@ -25,6 +25,8 @@ LOOKS: Final = 500
 """Looks for a newer file in the life of a certificate."""
 LOOK_S_MIN, LOOK_S_MAX = 0.2, 60.0
 JOIN_S: Final = 1.0
+RELOADS, REFUSED = "reloads", "reloads_refused"
+"""Counters of the shard."""
 
 _log = logging.getLogger("enact.shard")
 
@@ -55,61 +57,72 @@ def checked_keys(keys: KeyFiles, hosts: Iterable[str]) -> Certificate:
     return certificate
 
 
-class KeyWatch:
-    """Lets a shard take new files.
+class Reload:
+    """Takes the settings of a shard anew.  Thread-safe.
 
     Args:
-        keys: The shard's files.
-        certificate: What it serves with now.
-        reopen: Takes the files as they are and returns the new certificate; raises `EnactError` and
-            keeps the old one if they cannot be used.
+        take: Takes them and returns the certificate with which the shard serves now, if it has one;
+            raises `EnactError` and keeps the old ones if they cannot be used.
+        count: Adds to a counter of the shard.
+        keys: The shard's files, in a cell with keys.
     """
 
     def __init__(
-        self, keys: KeyFiles, certificate: Certificate, reopen: Callable[[], Certificate]
+        self,
+        take: Callable[[], Certificate | None],
+        count: Callable[[str], None],
+        keys: KeyFiles | None,
     ) -> None:
-        self._keys, self._reopen = keys, reopen
-        self._certificate = certificate
+        self._take, self._count, self._keys = take, count, keys
+        self._certificate = own_certificate(keys) if keys is not None else None
         self._taken_ns = self._changed_ns()
         self._ended = threading.Event()
         self._mutex = threading.Lock()
-        self._thread = threading.Thread(target=self._run, name="enact-keys", daemon=True)
-        self._thread.start()
+        self._thread: threading.Thread | None = None
+        if keys is not None:
+            self._thread = threading.Thread(target=self._run, name="enact-keys", daemon=True)
+            self._thread.start()
 
-    def reload(self) -> bool:
-        """Take the files as they are; return whether that worked, and log it."""
+    def __call__(self) -> bool:
+        """Take them as they are now; return whether that worked, and log it."""
         with self._mutex:
             self._taken_ns = self._changed_ns()
             began_s = time.monotonic()
             try:
-                self._certificate = self._reopen()
+                self._certificate = self._take()
             except EnactError as error:
+                self._count(REFUSED)
                 _log.error(
-                    "keys not reloaded, so the old ones stay: %s",
+                    "not reloaded, so the old keys, names and rights stay: %s",
                     error,
-                    extra={"event": "shard.keys_refused"},
+                    extra={"event": "shard.reload_refused"},
                 )
                 return False
+            until = self._certificate and day_of(self._certificate.ends_s)
             _log.info(
-                "keys reloaded in %.0f ms; the certificate is valid until %s",
+                "reloaded in %.0f ms%s",
                 (time.monotonic() - began_s) * 1e3,
-                day_of(self._certificate.ends_s),
-                extra={"event": "shard.keys"},
+                f"; the certificate is valid until {until}" if until else "",
+                extra={"event": "shard.reloaded"},
             )
+            self._count(RELOADS)
             return True
 
     def _run(self) -> None:
         while not self._ended.wait(self._pause_s()):
             if self._is_due():
-                self.reload()
+                self()
 
     def _pause_s(self) -> float:
-        life_s = self._certificate.ends_s - self._certificate.starts_s
+        certificate = self._certificate
+        life_s = certificate.ends_s - certificate.starts_s if certificate is not None else 0.0
         return min(LOOK_S_MAX, max(LOOK_S_MIN, life_s / LOOKS))
 
     def _is_due(self) -> bool:
         """Return whether the certificate ends soon and there is a file that was not tried."""
         now = self._certificate
+        if now is None:
+            return False
         left_s = now.ends_s - time.time()
         ends_soon = left_s < LAST_PART * (now.ends_s - now.starts_s)
         return ends_soon and self._changed_ns() > self._taken_ns
@@ -117,11 +130,12 @@ class KeyWatch:
     def _changed_ns(self) -> int:
         """Return when the certificate's file was last changed; 0 if that cannot be read."""
         try:
-            return self._keys.certificate.stat().st_mtime_ns
+            return self._keys.certificate.stat().st_mtime_ns if self._keys is not None else 0
         except OSError:
             return 0
 
     def close(self) -> None:
         """Look no more; idempotent."""
         self._ended.set()
-        self._thread.join(JOIN_S)
+        if self._thread is not None:
+            self._thread.join(JOIN_S)
