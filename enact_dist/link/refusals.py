@@ -66,7 +66,7 @@ def unreachable(
 ) -> ShardUnreachableError:
     """Return the error for a shard that does not answer, though it may run (`runs`)."""
     endpoint = carrier.endpoint_of(shard)
-    refused = "" if runs else carrier.reason_away(shard)
+    refused = carrier.reason_away(shard)
     advice = refused or (
         f"is it running? (enact shard ls; enact shard run {shard})"
         if not runs

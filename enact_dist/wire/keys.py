@@ -63,7 +63,7 @@ def identity_of(actor: str, host: str, pid: int) -> str:
     The process is a part of it: what one process may take of a shard is bounded, and two hundred
     processes of one name must not share one bound.
     """
-    return f"{quoted_name(actor or NAMELESS)}@{quoted_name(host or NOBODY)}:{pid}"
+    return f"{quoted_name(actor or NAMELESS)}@{quoted_name(host or '-')}:{pid}"
 
 
 def quoted_name(name: str) -> str:

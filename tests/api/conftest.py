@@ -23,7 +23,8 @@ def cell(carrier, tmp_path, monkeypatch):
         return
     from enact_dist.core.protocol.messages import PlacementMap, ShardEntry
     from enact_dist.core.shard.state import ShardSettings
-    from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
+    from enact_dist.link.daemon.daemon import start_shard
+    from enact_dist.link.daemon.settings import DaemonSettings
 
     monkeypatch.setenv("ENACT_SHARED_FOLDER", str(tmp_path))
     endpoint = free_endpoint()
@@ -57,7 +58,8 @@ class TwoShards:
 
     def start(self, name):
         from enact_dist.core.shard.state import ShardSettings
-        from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
+        from enact_dist.link.daemon.daemon import start_shard
+        from enact_dist.link.daemon.settings import DaemonSettings
 
         settings = ShardSettings(name, self._placement, worlds=WORLDS)
         folder = self._folder / name if self._folder is not None else None

@@ -8,7 +8,8 @@ from enact_dist import Aspect, Durability, Entity, Lock, Tolerance, Write, conne
 from enact_dist.core.protocol.messages import PlacementMap, ShardEntry
 from enact_dist.core.shard.state import ShardSettings
 from enact_dist.errors import ForgottenError
-from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
+from enact_dist.link.daemon.daemon import start_shard
+from enact_dist.link.daemon.settings import DaemonSettings
 
 SHIFT = Aspect("shift_mm", float, compare=Tolerance(absolute=0.5))
 SEEN = Aspect("seen", np.ndarray, Durability.VOLATILE)

@@ -7,7 +7,8 @@ import pytest
 from enact_dist import Aspect, Durability, Entity, Lock, Read, View, Write, connect
 from enact_dist.core.protocol.messages import Pin, PlacementMap, ShardEntry
 from enact_dist.core.shard.state import ShardSettings
-from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
+from enact_dist.link.daemon.daemon import start_shard
+from enact_dist.link.daemon.settings import DaemonSettings
 
 COUNT = Aspect("count", int)
 SUM = Aspect("sum", int)

@@ -13,7 +13,8 @@ import enact_dist
 from enact_dist import Aspect, Durability, Entity, Lock, Write, connect
 from enact_dist.core.protocol.messages import PlacementMap, ShardEntry
 from enact_dist.core.shard.state import ShardSettings
-from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
+from enact_dist.link.daemon.daemon import start_shard
+from enact_dist.link.daemon.settings import DaemonSettings
 
 PACKAGE = str(Path(enact_dist.__file__).parent)
 COUNT = Aspect("count", int, Durability.VOLATILE)

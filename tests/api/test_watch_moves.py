@@ -10,7 +10,8 @@ from enact_dist import Actor, Lock, World, connect
 from enact_dist.actor.running.process import ActorThread
 from enact_dist.core.protocol.messages import Pin, PlacementMap, ShardEntry
 from enact_dist.core.shard.state import ShardSettings
-from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
+from enact_dist.link.daemon.daemon import start_shard
+from enact_dist.link.daemon.settings import DaemonSettings
 from enact_dist.link.offline.rebalance import rebalance
 from enact_dist.recording import Recorder
 from enact_dist.recording.reading import Recording

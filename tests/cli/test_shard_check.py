@@ -6,7 +6,8 @@ import pytest
 
 from enact_dist.core.protocol.messages import PlacementMap, ShardEntry
 from enact_dist.core.shard.state import ShardSettings
-from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
+from enact_dist.link.daemon.daemon import start_shard
+from enact_dist.link.daemon.settings import DaemonSettings
 
 
 @pytest.fixture

@@ -131,7 +131,8 @@ def free_endpoints():
 @pytest.fixture
 def daemon(make_settings):
     """Start shards in this process: `daemon(endpoint, name=…)`; stopped after the test."""
-    from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
+    from enact_dist.link.daemon.daemon import start_shard
+    from enact_dist.link.daemon.settings import DaemonSettings
 
     running = []
 
@@ -263,7 +264,8 @@ import sys
 from pathlib import Path
 from enact_dist.core.protocol.messages import AspectEntry, PlacementMap, ShardEntry
 from enact_dist.core.shard.state import ShardSettings
-from enact_dist.link.daemon.daemon import DaemonSettings, run_shard
+from enact_dist.link.daemon.daemon import run_shard
+from enact_dist.link.daemon.settings import DaemonSettings
 endpoint, folder, log, durability = sys.argv[1:]
 shard = ShardSettings(
     "s0",

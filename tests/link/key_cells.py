@@ -7,7 +7,8 @@ from pathlib import Path
 from ports import free_port
 
 from enact_dist.config.read import load_config
-from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
+from enact_dist.link.daemon.daemon import start_shard
+from enact_dist.link.daemon.settings import DaemonSettings
 from enact_dist.link.zenoh.tls import KeyFiles, shard_keys
 from enact_dist.operate.keys import Authority, KeyOwner, make_authority, owners_of, put_keys
 
@@ -24,9 +25,10 @@ class KeyCell:
         folder: Of the test.
         shards: Endpoints by the names of shards; one shard `left` unless given.
         ttl_s: Of sessions.
+        more: Further tables of the file.
     """
 
-    def __init__(self, folder, shards=None, *, ttl_s=2.0, carrier="zenoh"):
+    def __init__(self, folder, shards=None, *, ttl_s=2.0, carrier="zenoh", more=""):
         self.folder = Path(folder)
         self.shards = shards or {"left": endpoint()}
         self.keys = self.folder / "keys"
@@ -34,7 +36,7 @@ class KeyCell:
         tables = "".join(f'[shards.{n}]\nlisten = "{e}"\n' for n, e in self.shards.items())
         self.file.write_text(
             f'name = "locked"\nworlds = ["online"]\nsession_ttl_s = {ttl_s}\ncarrier = "{carrier}"\n'
-            f'[security]\nkeys = "keys"\noperators = ["ada", "ben"]\n{tables}'
+            f'[security]\nkeys = "keys"\noperators = ["ada", "ben"]\n{tables}{more}'
         )
         make_authority("locked", self.folder / "authority")
         self.authority = Authority.load(self.folder / "authority")
@@ -77,6 +79,7 @@ class KeyCell:
             "carrier": config.carrier,
             "keys": shard_keys(config.security, shard),
             "names": config.key_holders,
+            "again": lambda: self.settings(shard, **options),
         }
         return DaemonSettings(**{**said, **options})
 

@@ -11,7 +11,8 @@ from enact_dist.core.protocol.messages import ListSessions, Pin, PlacementMap, S
 from enact_dist.core.shard import owners
 from enact_dist.core.shard.state import ShardSettings
 from enact_dist.errors import LinkError, MisuseError, ProtocolError, ShardUnreachableError
-from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
+from enact_dist.link.daemon.daemon import start_shard
+from enact_dist.link.daemon.settings import DaemonSettings
 
 COUNT = Aspect("count", int, Durability.VOLATILE)
 KEPT = Aspect("kept", int)

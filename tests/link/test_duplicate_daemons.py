@@ -28,7 +28,8 @@ from enact_dist.link.client.duplicate_daemons import (
     moved_places,
     serving,
 )
-from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
+from enact_dist.link.daemon.daemon import start_shard
+from enact_dist.link.daemon.settings import DaemonSettings
 from enact_dist.link.zenoh.discovery import FoundShard
 from enact_dist.operate.doctor_cell import duplicate_daemons
 

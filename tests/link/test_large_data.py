@@ -22,7 +22,8 @@ from enact_dist import (
 from enact_dist.core.protocol.messages import Pin, PlacementMap, ShardEntry
 from enact_dist.core.shard.state import ShardSettings
 from enact_dist.errors import LeaseLostError
-from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
+from enact_dist.link.daemon.daemon import start_shard
+from enact_dist.link.daemon.settings import DaemonSettings
 from enact_dist.link.folder.blobs import BlobFolder
 
 CLOUD = Aspect("cloud", np.ndarray, Durability.VOLATILE)

@@ -5,7 +5,8 @@ import pytest
 
 from enact_dist import Aspect, Durability, Entity, Lock, View, Write, connect
 from enact_dist.errors import ForgottenError, NoRoomError
-from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
+from enact_dist.link.daemon.daemon import start_shard
+from enact_dist.link.daemon.settings import DaemonSettings
 from enact_dist.link.memory.maps import leftovers
 
 CLOUD = Aspect("cloud", np.ndarray, Durability.VOLATILE, retention=10)

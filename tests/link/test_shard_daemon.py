@@ -24,7 +24,8 @@ from enact_dist.core.protocol.messages import (
 )
 from enact_dist.errors import ConfigError, LinkError, StoreError
 from enact_dist.link.daemon import daemon as shard_daemon
-from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
+from enact_dist.link.daemon.daemon import start_shard
+from enact_dist.link.daemon.settings import DaemonSettings
 from enact_dist.link.zenoh.config import close_session, open_session
 from enact_dist.link.zenoh.service import ZenohService
 from enact_dist.terms import Access

@@ -10,7 +10,8 @@ from ports import free_endpoint
 from enact_dist import Aspect, Durability, Entities, Entity, Lock, View, Write, connect
 from enact_dist.config.read import load_config
 from enact_dist.errors import LinkError, PermissionDeniedError
-from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
+from enact_dist.link.daemon.daemon import start_shard
+from enact_dist.link.daemon.settings import DaemonSettings
 from enact_dist.link.socket.peers import PeerCredentials
 
 pytestmark = pytest.mark.carrier("auto")

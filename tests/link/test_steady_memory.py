@@ -18,7 +18,8 @@ from enact_dist import Aspect, Durability, Entity, Lock, View, Write, connect
 from enact_dist.core.client.lease_clock import SENDINGS_KEPT
 from enact_dist.core.state import grants as tenures
 from enact_dist.core.state import history
-from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
+from enact_dist.link.daemon.daemon import start_shard
+from enact_dist.link.daemon.settings import DaemonSettings
 from enact_dist.link.memory.maps import leftovers
 
 CLOUD = Aspect("cloud", np.ndarray, Durability.VOLATILE, retention=1)

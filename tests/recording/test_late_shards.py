@@ -10,7 +10,8 @@ from enact_dist import Aspect, Entity, Lock, Write, connect
 from enact_dist.core.protocol.messages import Finish
 from enact_dist.core.protocol.parts import Pin, PlacementMap, ShardEntry
 from enact_dist.core.shard.state import ShardSettings
-from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
+from enact_dist.link.daemon.daemon import start_shard
+from enact_dist.link.daemon.settings import DaemonSettings
 from enact_dist.recording import Recorder, recorder, settling
 from enact_dist.recording.reading import Recording
 

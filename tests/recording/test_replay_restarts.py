@@ -8,7 +8,8 @@ from enact_dist import Aspect, Entity, View, connect
 from enact_dist.core.protocol.parts import PlacementMap, ShardEntry
 from enact_dist.core.shard.state import ShardSettings
 from enact_dist.errors import DatumTypeError
-from enact_dist.link.daemon.daemon import DaemonSettings, start_shard
+from enact_dist.link.daemon.daemon import start_shard
+from enact_dist.link.daemon.settings import DaemonSettings
 from enact_dist.recording import Replay
 
 piece, other = Entity("piece"), Entity("other")

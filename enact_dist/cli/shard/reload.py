@@ -82,12 +82,10 @@ def _reload(config: CellConfig, shard: ShardConfig, options: argparse.Namespace)
 
 def _counts(cell: Cell, shard: str) -> tuple[int, int] | None:
     """Return how often a shard has reloaded and how often it could not; None if it is away."""
-    from enact_dist.link.daemon.reload import REFUSED, RELOADS
-
     found = next(one for one in cell.shards() if one.name == shard)
     if not found.reachable:
         return None
-    return found.counters.get(RELOADS, 0), found.counters.get(REFUSED, 0)
+    return found.counters.get("reloads", 0), found.counters.get("reloads_refused", 0)
 
 
 def listening_process(port: int) -> int | None:

@@ -26,7 +26,8 @@ def run_shard(options: argparse.Namespace) -> int:
     """Run one shard daemon in this process."""
     from enact_dist.config.environment import variable_of
     from enact_dist.config.read import load_config
-    from enact_dist.link.daemon import daemon as shard_daemon
+    from enact_dist.link.daemon.daemon import run_shard as run_shard_daemon
+    from enact_dist.link.daemon.settings import DRAIN_S, DaemonSettings
     from enact_dist.link.zenoh.tls import shard_keys
 
     target = cell_target(options)
@@ -42,13 +43,13 @@ def run_shard(options: argparse.Namespace) -> int:
         if found:
             environment[variable_of(options.name, key)] = found
 
-    def settings() -> shard_daemon.DaemonSettings:
+    def settings() -> DaemonSettings:
         # The name comes first: an override for a shard that is not there would blame the override.
         written = load_config(target).shard(options.name)
         config = load_config(target, environment=environment)
         shard = config.shard(options.name)
         drain_s = shard.drain_s if options.drain_s is None else options.drain_s
-        return shard_daemon.DaemonSettings(
+        return DaemonSettings(
             cell=config.name,
             shard=config.shard_settings(shard.name),
             listen=shard.listen,
@@ -62,10 +63,10 @@ def run_shard(options: argparse.Namespace) -> int:
             keys=shard_keys(config.security, shard.name),
             names=config.key_holders,
             again=settings,
-            drain_s=shard_daemon.DRAIN_S if drain_s is None else drain_s,
+            drain_s=DRAIN_S if drain_s is None else drain_s,
         )
 
-    return shard_daemon.run_shard(settings())
+    return run_shard_daemon(settings())
 
 
 def list_shards(options: argparse.Namespace) -> Output:

@@ -17,7 +17,7 @@ import sys
 import threading
 import time
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import chain
 from typing import TYPE_CHECKING, Final
 
@@ -34,35 +34,31 @@ from enact_dist.link.client.duplicate_daemons import (
 )
 from enact_dist.link.daemon.reload import Reload, checked_keys
 from enact_dist.link.daemon.service_manager import ServiceManager
+from enact_dist.link.daemon.settings import DRAIN_S, DaemonSettings
 from enact_dist.link.daemon.shard_calls import ShardCalls
 from enact_dist.link.log import READY, JsonLines, Log, TextLines, say
 from enact_dist.link.memory.shared_folder import SharedFolder
 from enact_dist.link.opening import open_host
 from enact_dist.link.signals import StopSignals
 from enact_dist.link.socket.service import SocketService
-from enact_dist.link.zenoh.access import common_name, read_revoked
 from enact_dist.link.zenoh.config import close_session, listening_settings, open_session, to_reach
 from enact_dist.link.zenoh.discovery import FoundShard, find_shards
-from enact_dist.link.zenoh.endpoints import somebody_listens, split_endpoint
+from enact_dist.link.zenoh.endpoints import somebody_listens
 from enact_dist.link.zenoh.service import ZenohService
 from enact_dist.wire.keys import name_in
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Container, Mapping
-    from pathlib import Path
+    from collections.abc import Container, Mapping
 
     import zenoh
 
     from enact_dist.core.protocol.messages import Answer
-    from enact_dist.core.shard.state import ShardSettings
     from enact_dist.link.daemon.metrics import MetricsServer
     from enact_dist.link.host import ShardHost
-    from enact_dist.link.zenoh.tls import Certificate, KeyFiles
+    from enact_dist.link.zenoh.tls import Certificate
 
 PROBE_S: Final = 0.3
 """How long another daemon with our name may take to answer before we start."""
-DRAIN_S: Final = 0.8
-"""Default time for holders to finish; together with the rest it stays below 2 s."""
 RECONNECT_S: Final = 2.0
 """How long clients may take to connect again when the shard has taken new keys."""
 REOPEN_S, REOPEN_PAUSE_S = 5.0, 0.02
@@ -73,69 +69,6 @@ GC_THRESHOLDS: Final = (5_000, 20, 1_000_000)
 """Allocations between two collections of young objects, and how rarely older ones are examined."""
 
 _log = logging.getLogger("enact.shard")
-
-
-@dataclass(frozen=True, slots=True)
-class DaemonSettings:
-    """The settings of a shard daemon.
-
-    Attributes:
-        cell: Name of the cell.
-        shard: The settings of the shard, with its name and the endpoints for clients.
-        listen: Endpoints to listen at ("tcp/0.0.0.0:7447").
-        folder: Its data folder; None keeps data in memory only.
-        log: "text" or "json" (one object per line, see `link.log`).
-        link_lease_s: A connection counts as lost after this time without a sign of life.
-        carrier: How clients of this host may reach it.  "auto": also over a socket, if one can be
-            made; "socket": it is an error if none can be made; "zenoh": no socket.
-        shared_bytes_max: Byte limit of large data in memory shared on this host.  Beyond it,
-            history is removed, then writes are refused.  None: half of the file system there, and
-            plain memory beyond; 0: nothing is shared.
-        drain_s: How long holders may still take to finish after a signal.
-        metrics: Host and port for Prometheus, see `link.daemon.metrics`; None: no server.
-        written: The shard's endpoints in `cell.toml`, even if this start overrides them.
-        keys: The files by which the shard proves its name, in a cell with keys.
-        names: Names of clients that have a key.
-        again: Reads the settings anew; a reload takes keys, names and rights from them.
-    """
-
-    cell: str
-    shard: ShardSettings
-    listen: tuple[str, ...]
-    folder: Path | None = None
-    log: str = "text"
-    link_lease_s: float = 1.0
-    carrier: str = "auto"
-    shared_bytes_max: int | None = None
-    drain_s: float = DRAIN_S
-    metrics: tuple[str, int] | None = None
-    written: tuple[str, ...] = ()
-    keys: KeyFiles | None = None
-    names: tuple[str, ...] = ()
-    again: Callable[[], DaemonSettings] | None = None
-
-    @property
-    def common_names(self) -> dict[str, str] | None:
-        """The common names of the clients' certificates by their names; None without keys.
-
-        Raises:
-            ConfigError: The list of revoked keys cannot be used.
-        """
-        if self.keys is None:
-            return None
-        revoked = read_revoked(self.keys.folder)
-        return {name: common_name(name, revoked.get(name, 0)) for name in self.names}
-
-    @property
-    def hosts(self) -> tuple[str, ...]:
-        """Where it serves; every address of its host counts as the loopback."""
-        own = [
-            entry.endpoints
-            for entry in self.shard.placement.shards
-            if entry.name == self.shard.name
-        ]
-        places = map(to_reach, chain(self.listen, *own))
-        return tuple(dict.fromkeys(split_endpoint(place)[1].strip("[]") for place in places))
 
 
 class RunningShard:
@@ -221,7 +154,7 @@ class RunningShard:
         Raises:
             EnactError: They cannot be used; nothing has changed.
         """
-        settings = self._read_again()
+        settings = self.settings.read_again()
         keys, rights = settings.keys, settings.shard.rights
         with self._stopping:
             certificate = checked_keys(keys, settings.hosts) if keys is not None else None
@@ -241,24 +174,6 @@ class RunningShard:
             if keys is not None:
                 self._reopen(barred)
         return certificate
-
-    def _read_again(self) -> DaemonSettings:
-        """Return the settings with keys, names and rights as their files have them now.
-
-        Raises:
-            ConfigError: They cannot be read, or the shard would have to be started again.
-        """
-        now = self.settings
-        new = now.again() if now.again is not None else now
-        for what, had, has in (
-            ("[security] keys", now.keys, new.keys),
-            ("[rights]", now.shard.rights, new.shard.rights),
-        ):
-            if (had is None) != (has is None):
-                change = "removed" if has is None else "added"
-                raise ConfigError(f"{what} was {change}: that takes a restart of the shard")
-        shard = replace(now.shard, rights=new.shard.rights)
-        return replace(now, shard=shard, names=new.names, keys=new.keys)
 
     def _reopen(self, barred: Container[str]) -> None:
         """Open the Zenoh session with the settings of now, and end the sessions of barred names."""

@@ -25,8 +25,6 @@ LOOKS: Final = 500
 """Looks for a newer file in the life of a certificate."""
 LOOK_S_MIN, LOOK_S_MAX = 0.2, 60.0
 JOIN_S: Final = 1.0
-RELOADS, REFUSED = "reloads", "reloads_refused"
-"""Counters of the shard."""
 
 _log = logging.getLogger("enact.shard")
 
@@ -91,7 +89,7 @@ class Reload:
             try:
                 self._certificate = self._take()
             except EnactError as error:
-                self._count(REFUSED)
+                self._count("reloads_refused")
                 _log.error(
                     "not reloaded, so the old keys, names and rights stay: %s",
                     error,
@@ -105,7 +103,7 @@ class Reload:
                 f"; the certificate is valid until {until}" if until else "",
                 extra={"event": "shard.reloaded"},
             )
-            self._count(RELOADS)
+            self._count("reloads")
             return True
 
     def _run(self) -> None:

@@ -146,6 +146,15 @@ def refuse_other_name(actor: str, identity: str) -> None:
         )
 
 
+def barred(name: str, shard: str) -> str:
+    """Return why a shard that is there answers no request of a name."""
+    return (
+        f"shard {shard} is running, but admits no client with this key of {name}: its keys were"
+        " revoked, or the shard's cell.toml names no such actor, operator or program; add it there"
+        f" or make new keys (enact cell keys renew {name}), then run enact shard reload"
+    )
+
+
 def common_name(name: str, revoked: int) -> str:
     """Return the common name of the certificates of a name whose keys were revoked so often."""
     return f"{name}~{revoked}" if revoked else name
@@ -173,7 +182,7 @@ def read_revoked(folder: Path) -> dict[str, int]:
     for name, number in found.items():
         if type(number) is not int or number < 1:
             raise ConfigError(
-                f"{file}: {name} = {number!r} says nothing; `enact cell keys revoke` writes how"
+                f"{file}: {name} = {number!r} is no count; `enact cell keys revoke` writes how"
                 f" often its keys were revoked, such as {name} = 1",
                 path=str(file),
             )

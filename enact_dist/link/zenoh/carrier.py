@@ -21,6 +21,7 @@ from __future__ import annotations
 import logging
 import os
 import threading
+import time
 from collections import deque
 from dataclasses import dataclass
 from functools import partial
@@ -28,11 +29,12 @@ from typing import TYPE_CHECKING, Final
 
 import zenoh
 
-from enact_dist.core.protocol.messages import Notice
+from enact_dist.core.protocol.messages import ListPlaces, Notice
 from enact_dist.errors import ProtocolError, ShardUnreachableError
 from enact_dist.link.carrier import check_usable, failure_of
 from enact_dist.link.memory.maps import recycle_blocks
 from enact_dist.link.notices import NoticeQueue
+from enact_dist.link.zenoh.access import barred
 from enact_dist.link.zenoh.config import (
     OPEN_S,
     QUEUED_MAX,
@@ -389,8 +391,19 @@ class ZenohCarrier:
 
     def reason_away(self, shard: str) -> str:
         """Return why a shard's certificate or ours is refused; empty if that is not the reason."""
+        if self._keys is None:
+            return ""
         endpoints = self._endpoints_of.get(shard) or self._links[0].endpoints
-        return why_refused(endpoints, self._keys, shard)
+        refused = why_refused(endpoints, self._keys, shard)
+        return refused or (barred(self._keys.name, shard) if self._is_barred(shard) else "")
+
+    def _is_barred(self, shard: str) -> bool:
+        """Return whether a shard lets any key ping, but ends other queries of ours at once."""
+        if self.request(shard, QUESTION, timeout_s=REACH_S) is None:
+            return False
+        began_s = time.monotonic()
+        answer = self.request(shard, ListPlaces(), timeout_s=REACH_S)
+        return answer is None and time.monotonic() - began_s < REACH_S / 2
 
     # ---------------------------------------------------------------- notices
 

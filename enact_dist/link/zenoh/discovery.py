@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.messages import Welcome
-from enact_dist.errors import ShardUnreachableError
+from enact_dist.errors import PermissionDeniedError, ShardUnreachableError
 from enact_dist.link.refusals import error_for
+from enact_dist.link.zenoh.access import barred
 from enact_dist.link.zenoh.config import close_session, open_session
 from enact_dist.link.zenoh.endpoints import unknown_hosts
 from enact_dist.link.zenoh.queries import (
@@ -38,6 +39,9 @@ if TYPE_CHECKING:
 
 PROBE_LEASE_S: Final = 1.0
 """Link lease of the short sessions that only look for shards."""
+AT_ONCE_S: Final = 0.05
+BARRED_COUNT: Final = 5
+"""A shard that bars our name ends each query at once; one that opens again does so only briefly."""
 SHORTEST_S: Final = 0.05
 """Shortest time given to one query."""
 
@@ -74,14 +78,23 @@ def discover(
             certificate was refused.
         ConfigError: An endpoint cannot be read, or the keys for one cannot be used.
         ProtocolError: An answer cannot be read, or does not answer a hello.
+        PermissionDeniedError: The shard admits no client with our key.
     """
     deadline_s = time.monotonic() + timeout_s
-    silent = ""
+    silent, ended_at_once = "", 0
     with _probe(endpoints, timeout_s, keys) as probe:
         while time.monotonic() < deadline_s:
             for found in probe.find(deadline_s):
                 silent = found.shard
+                asked_s = time.monotonic()
                 answer = probe.greet(found, hello, deadline_s)
+                if answer is None and keys is not None and time.monotonic() - asked_s < AT_ONCE_S:
+                    ended_at_once += 1
+                    if ended_at_once == BARRED_COUNT:
+                        raise PermissionDeniedError(
+                            barred(keys.name, found.shard), identity=keys.name
+                        )
+                    time.sleep(SHORTEST_S)
                 if isinstance(answer, Welcome):
                     return found.cell, answer
                 if answer is not None:

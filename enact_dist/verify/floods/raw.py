@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
     from enact_dist.config.types import CellConfig
     from enact_dist.core.protocol.messages import Answer, Request
+    from enact_dist.link.zenoh.tls import KeyFiles
 
 ACTOR: Final = "attacker"
 SILENT: Final = "no answer"
@@ -63,13 +64,16 @@ class RawZenoh:
     Args:
         config: The cell.
         mode: Of the session; a client of this project is a "peer".
+        keys: The attacker's key, in a cell with keys.
     """
 
-    def __init__(self, config: CellConfig, *, mode: str = "peer") -> None:
+    def __init__(
+        self, config: CellConfig, *, mode: str = "peer", keys: KeyFiles | None = None
+    ) -> None:
         self.tally: Counter[str] = Counter()
         self._config = config
         endpoints = [e for shard in config.placement_map().shards for e in shard.endpoints]
-        settings = session_config(connect=endpoints, lease_s=LEASE_S)
+        settings = session_config(connect=endpoints, lease_s=LEASE_S, keys=keys)
         settings.insert_json5("mode", json.dumps(mode))
         self.session = zenoh.open(settings)
         self._window = threading.Semaphore(WINDOW)
@@ -84,17 +88,20 @@ class RawZenoh:
         """Return the key of a request."""
         return request_key(self._config.name, shard, verb, actor)
 
-    def welcome(self, shard: str, session: str) -> Welcome:
-        """Open a session; wait until the shard can be reached.
+    def welcome(
+        self, shard: str, session: str, *, identity: str = ACTOR, actor: str = ACTOR
+    ) -> Welcome:
+        """Open a session under an identity; wait until the shard can be reached.
 
         Raises:
             LinkError: It stayed without an answer.
         """
         end_s = time.monotonic() + CONNECT_S
         while time.monotonic() < end_s:
-            answer = self.ask(shard, hello(session), timeout_s=ANSWER_S)
+            greeting = hello(session, actor=actor)
+            answer = self.ask(shard, greeting, actor=identity, timeout_s=ANSWER_S)
             if isinstance(answer, Welcome):
-                self.ask(shard, hello(session, answer.epoch))
+                self.ask(shard, hello(session, answer.epoch, actor=actor), actor=identity)
                 return answer
             time.sleep(0.05)
         raise LinkError(f"shard {shard} does not welcome the attacker")
