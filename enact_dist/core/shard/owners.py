@@ -2,9 +2,9 @@
 
 The identity under which a message came decides.  An identity is a short text.  The transport says
 it with each message (`Shard.handle`), and this module is all that asks for it, so that what vouches
-for an identity may change without the rules.  Today a client says its own: actor, host and process,
-in the key of its requests and when it opens a socket.  That stops a fault or a stray tool; against
-malice it needs certificates or users, whose name stands in the same place then.
+for an identity may change without the rules.  A client says its own: name, host and process, in the
+key of its requests and when it opens a socket.  That stops a fault or a stray tool.  Against malice
+a cell needs keys: then certificates prove the names (`enact_dist.link.zenoh.access`).
 
 Rules to keep
 
