@@ -21,6 +21,7 @@ from enact_dist.bench.cases.memory import run_memory
 from enact_dist.bench.cases.palletizing import run_palletizing
 from enact_dist.bench.cases.payloads import run_fetch, run_publish, run_wakeup
 from enact_dist.bench.cases.pipeline import run_pipeline
+from enact_dist.bench.cases.security import run_security
 from enact_dist.bench.cases.updates import run_durable, run_multi, run_update, run_waiters
 from enact_dist.bench.cases.workcell import run_workcell
 from enact_dist.bench.floors import Floors
@@ -73,6 +74,7 @@ BENCHES: Final[dict[str, Callable[[Run], None]]] = {
     "stopped": run_stopped,
     "memory": run_memory,
     "recovery": run_recovery,
+    "security": run_security,
     "workcell": run_workcell,
     "palletizing": run_palletizing,
 }

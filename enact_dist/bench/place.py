@@ -7,11 +7,14 @@ import json
 import os
 import signal
 import tempfile
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.bench.visit import Visit, anywhere
+from enact_dist.config.read import load_config
 from enact_dist.config.types import CARRIERS
+from enact_dist.errors import MisuseError
 from enact_dist.link.memory.shared_folder import MEMORY, SHARED_FOLDER_VARIABLE
 from enact_dist.operate.supervise import SUPERVISOR_VARIABLE
 from enact_dist.verify.daemons import COMMAND, KeptPorts, LineProcess, write_cell
@@ -69,6 +72,7 @@ class Place:
         carriers: How benches that compare them reach the cell, `EMBEDDED` among others.
         shared: What the shared folder of an own cell is to be; None for that of this user.
         said: Called with what a person should know of what stays in a cell that runs.
+        names: How many names have keys and rights in an own cell; 0: it has neither.
     """
 
     def __init__(
@@ -80,12 +84,14 @@ class Place:
         carriers: tuple[str, ...],
         shared: Path | None = None,
         said: Callable[[str], None] = lambda _text: None,
+        names: int = 0,
     ) -> None:
         self.folder = folder
         self.carriers = carriers
         self.own = target is None
         self.shard_names = tuple(f"s{number}" for number in range(shards)) if self.own else ()
         self._target = target
+        self._names = names
         self._cells: dict[str, Cell] = {}
         self._stack = contextlib.ExitStack()
         self._logs = 0
@@ -131,13 +137,16 @@ class Place:
     def _start_daemons(self) -> str:
         file, ports = self.folder / "cell.toml", KeptPorts()
         self._stack.callback(ports.close)
+        way = "tls" if self._names else "tcp"
         write_cell(
             file,
             "bench",
             worlds=[WORLD],
-            listen={name: f"tcp/127.0.0.1:{ports.free()}" for name in self.shard_names},
+            listen={name: f"{way}/127.0.0.1:{ports.free()}" for name in self.shard_names},
             pins={f"{name}/**": name for name in self.shard_names},
         )
+        if self._names:
+            secure(file, self._names)
         # They end with us, however we end: nothing else would ever stop them.
         with environment(**{CARRIER_VARIABLE: "auto", SUPERVISOR_VARIABLE: str(os.getpid())}):
             self._daemons = [
@@ -273,9 +282,37 @@ class Place:
         return [daemon.pid for daemon in self._daemons]
 
 
+def secure(file: Path, names: int) -> None:
+    """Give keys and rights to so many names of a cell, the first of them an operator.
+
+    Raises:
+        MisuseError: This Python cannot make keys.
+    """
+    if find_spec("cryptography") is None:
+        raise MisuseError("keys need cryptography: install the extra 'keys'")
+    from enact_dist.operate.keys import Authority, make_authority, owners_of, write_keys
+
+    programs = [f"program{number}" for number in range(1, names)]
+    rules = "".join(
+        f'[[rights.allow]]\nwho = "{name}"\nwrite = "{WORLD}:{name}/**"\n' for name in programs
+    )
+    with file.open("a", encoding="utf-8") as text:
+        text.write(
+            f'[security]\nkeys = "keys"\noperators = ["bench"]\n'
+            f'[rights]\ndefault = "none"\nprograms = {json.dumps(programs)}\n{rules}'
+        )
+    make_authority(file.stem, file.parent / "authority")
+    authority = Authority.load(file.parent / "authority")
+    for owner in owners_of(load_config(file, environment={})):
+        write_keys(authority, owner, file.parent / "keys")
+
+
 @contextlib.contextmanager
-def fresh_place(carrier: str = "auto") -> Iterator[tuple[Place, Path]]:
-    """Give a cell of one daemon that has served nothing before, and its shared folder."""
+def fresh_place(carrier: str = "auto", *, names: int = 0) -> Iterator[tuple[Place, Path]]:
+    """Give a cell of one daemon that has served nothing before, and its shared folder.
+
+    See `Place` for `names`.
+    """
     root = MEMORY if MEMORY.is_dir() else None
     with contextlib.ExitStack() as stack:
         folder, memory = (
@@ -283,5 +320,7 @@ def fresh_place(carrier: str = "auto") -> Iterator[tuple[Place, Path]]:
             for at in (None, root)
         )
         shared = memory / "shared"
-        place = Place(folder, target=None, shards=1, carriers=(carrier,), shared=shared)
+        place = Place(
+            folder, target=None, shards=1, carriers=(carrier,), shared=shared, names=names
+        )
         yield stack.enter_context(place), shared

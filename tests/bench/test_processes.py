@@ -14,6 +14,7 @@ from enact_dist.bench.cases.pipeline_worker import (
     mask_of,
     tick_of_set,
 )
+from enact_dist.bench.cases.security import run_security
 from enact_dist.bench.cases.updates import slots, update
 from enact_dist.bench.command import BENCHES
 from enact_dist.bench.floors import ECHO, FDATASYNC, PUBLISH, QUERY, Floors
@@ -61,6 +62,19 @@ def test_memory_of_a_slot_is_that_of_a_daemon_of_its_own(new_run, monkeypatch):
         "shard, growth with commits",
     )
     assert 200 < slot.value < 10_000
+
+
+def test_security_compares_a_cell_with_keys_to_a_plain_one(new_run):
+    """Each row of the secured cell is divided by the same one of the plain cell."""
+    pytest.importorskip("cryptography", reason="making keys needs the extra 'keys'")
+    run = new_run("zenoh")
+    run_security(run)
+
+    rows = {row.variant: row for row in run.rows()}
+    for name in ("call", "update, volatile", "30 MB read"):
+        assert rows[f"{name}, plain"].ratio is None
+        assert rows[f"{name}, keys, rules for 61 names"].ratio > 0
+    assert rows["right, known"].median_us < rows["right, new, 1,000 rules"].median_us
 
 
 def test_every_kind_of_floor_gives_times(new_run):

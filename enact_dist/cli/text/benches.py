@@ -56,6 +56,12 @@ BENCHES: Final = {
         guest=False,
         minutes=True,
     ),
+    "security": Told(
+        "what keys and rights cost a call, an update and large data; needs the extra 'keys'",
+        alone=False,
+        guest=False,
+        named=True,
+    ),
     "workcell": Told(
         "eight cameras, hull, speed and path of `enact demo workcell`, scored on its truth;"
         " --embedded plays twelve scenarios in simulated time, which no load changes, for its"
