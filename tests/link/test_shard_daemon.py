@@ -110,7 +110,7 @@ def test_daemon_that_fails_at_its_last_step_lets_go_of_everything(
 ):
     """Its folder, its endpoint and its socket can be taken by the next one at once."""
 
-    def broken(*_):
+    def broken(*_, **__):
         raise LinkError("no queryable")
 
     with monkeypatch.context() as patched:

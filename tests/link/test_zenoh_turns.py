@@ -182,7 +182,7 @@ def test_tick_waits_for_what_has_arrived_before_it(stopped, sender, monkeypatch)
         sender.post(name)
     stopped.wait_arrived()
     drained = []
-    service = stopped.host._inboxes[-1].__self__
+    service = [*stopped.host._inboxes][-1].__self__
     timer = threading.Thread(
         target=lambda: (service.drain_inbox(), drained.append(len(stopped.submitted)))
     )
