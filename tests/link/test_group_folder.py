@@ -1,13 +1,23 @@
 """A folder that users of one group share: who may write a payload, and who may not find it."""
 
 import os
+import shutil
 import stat
+import subprocess
+import sys
+import tempfile
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from ports import free_endpoint
 from test_payload_desk import FILE, SIZE, adopted, names, stage
 
 from enact_dist import Aspect, Durability, Entity, Lock, View, Write, connect
+from enact_dist.config.read import load_config
+from enact_dist.link.daemon.daemon import start_shard
+from enact_dist.link.daemon.settings import DaemonSettings
 from enact_dist.link.memory.payload_desk import PayloadDesk
 from enact_dist.link.memory.shared_folder import SharedFolder
 
@@ -103,3 +113,81 @@ def test_large_data_go_through_a_folder_of_a_group_without_a_copy(folder, daemon
 
     assert shard.host._payloads.figures()["payloads_adopted"] == 1
     assert mode_of(shard._shared.path) == 0o2710
+
+
+OTHER_USER = """
+import importlib, os, pkgutil, sys
+import numpy as np
+import enact_dist.core, enact_dist.link, enact_dist.wire
+from enact_dist import Aspect, Durability, Entity, Lock, View, Write, connect
+from enact_dist.errors import PermissionDeniedError
+
+for package in (enact_dist.core, enact_dist.link, enact_dist.wire):
+    for found in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+        importlib.import_module(found.name)
+os.setgroups([4242]), os.setgid(4243), os.setuid(4243)
+cloud = Aspect("cloud", np.ndarray, Durability.VOLATILE)
+with connect(sys.argv[1], actor="writer") as cell:
+    world = cell.world("online")
+    for value in (2, 3):
+        with Lock(write := Write(world, Entity("open/arm"), cloud)) as lock:
+            assert lock[write][0] == value - 1
+            lock[write] = np.full(100_000, value)
+    view = View(world, Entity("secret/arm"), cloud)
+    try:
+        world.view(view)
+    except PermissionDeniedError as error:
+        print(error.right, cell.statistics()["maps_failed"])
+    folder = os.path.join(os.environ["ENACT_SHARED_FOLDER"], sys.argv[2])
+    for file in sys.argv[3:]:
+        for access in (os.O_RDWR, os.O_RDONLY):
+            try:
+                os.open(os.path.join(folder, file), access)
+            except OSError as error:
+                print(type(error).__name__)
+"""
+
+
+@pytest.mark.carrier("auto")
+def test_users_of_a_cell_with_rights_get_copies(tmp_path, monkeypatch):
+    """Files have no rights per datum: who knows the name of one could read what he may not."""
+    if os.geteuid() != 0:
+        pytest.skip("becomes another user")
+    root = Path(tempfile.mkdtemp(prefix="enact-test-"))
+    os.chown(root, -1, 4242)
+    root.chmod(0o2770)
+    monkeypatch.setenv("ENACT_SHARED_FOLDER", str(root))
+    file, endpoint = tmp_path / "cell.toml", free_endpoint()
+    file.write_text(
+        f'name = "guarded"\nworlds = ["online"]\ncarrier = "socket"\n'
+        f'[shards.s]\nlisten = "{endpoint}"\n[security]\noperators = ["ada"]\n'
+        '[rights]\nuids = { 4243 = "writer" }\n'
+        '[[rights.allow]]\nwho = "writer"\nread = "online:open/**"\nwrite = "online:open/**"\n'
+    )
+    config = load_config(file, environment={})
+    settings = DaemonSettings(config.name, config.shard_settings("s"), (endpoint,))
+    shard = start_shard(replace(settings, carrier="socket"))
+    try:
+        with connect(file, actor="ada") as ada:
+            cloud = Aspect("cloud", np.ndarray, Durability.VOLATILE)
+            writes = [
+                Write(ada.world("online"), Entity(name), cloud)
+                for name in ("open/arm", "secret/arm")
+            ]
+            with Lock(*writes) as lock:
+                for write in writes:
+                    lock[write] = np.full(100_000, 1)
+            assert "payload_fallbacks" not in ada.statistics()
+            payloads = [one.name for one in shard._shared.path.glob("*-*")]
+            files = [one for one in payloads if not one.startswith("uses-")]
+            words = [sys.executable, "-c", OTHER_USER, endpoint, shard._shared.name, *files]
+            told = subprocess.run(words, capture_output=True, text=True, check=False)
+            assert told.returncode == 0, told.stderr
+            assert told.stdout.split() == ["read", "1", *["PermissionError"] * 2 * len(files)]
+            assert len(files) == 2
+            view = View(online := ada.world("online"), Entity("open/arm"), cloud)
+            assert online.view(view)[view].sum() == 300_000
+        assert {mode_of(shard._shared.path / one) for one in files} == {0o400}
+    finally:
+        shard.stop(drain_s=0.0)
+        shutil.rmtree(root)

@@ -296,7 +296,8 @@ def _shared_folder(settings: DaemonSettings) -> SharedFolder | None:
     if settings.carrier == "zenoh" and settings.shared_bytes_max == 0:
         return None
     try:
-        return SharedFolder(settings.cell, settings.shard.name)
+        private = settings.shard.rights is not None
+        return SharedFolder(settings.cell, settings.shard.name, private=private)
     except LinkError as error:
         if settings.carrier == "socket":
             raise

@@ -118,15 +118,19 @@ def _cut_off(pages: Pages, descriptor: int) -> None:
 
 
 class _Shared:
-    """The shared folder of one start of a shard, if this process sees it."""
+    """The shared folder of one start of a shard, if this process sees it.
 
-    __slots__ = ("epoch", "folder", "keeps", "name", "nonce", "page")
+    Attributes:
+        closed: Whether its files are for the shard's own user alone, and this is another.
+    """
+
+    __slots__ = ("closed", "epoch", "folder", "keeps", "name", "nonce", "page")
 
     def __init__(self, welcome: Welcome) -> None:
         self.name, self.nonce, self.epoch = welcome.shared, welcome.shared_nonce, welcome.epoch
         self.folder: OpenedFolder | None = None
         self.page: ClientPage | None = None
-        self.keeps = False
+        self.keeps = self.closed = False
 
     def __del__(self) -> None:
         if self.folder is not None:
@@ -177,7 +181,9 @@ class SharedPayloads:
 
     def _folder(self, shard: str) -> _Shared | None:
         shared = self._shards.get(shard)
-        return shared if shared is not None and shared.folder is not None else None
+        if shared is None or shared.folder is None or shared.closed:
+            return None
+        return shared
 
     # ---------------------------------------------------------------- kept grants
 
@@ -254,7 +260,9 @@ class SharedPayloads:
             name = answer.draft or file
             return Draft(shard, file, size, self._opened(shared, name, size, os.O_RDWR))
         except OSError as error:
-            # Most likely the folder is read-only here.
+            # Most likely the folder is read-only here, or that of another user in a cell with
+            # rights.
+            shared.closed = isinstance(error, PermissionError)
             self._count("payload_fallbacks")
             _log.info("payload %s of shard %s: %s", file, shard, error)
             self.drop(shard, file)
@@ -333,6 +341,7 @@ class SharedPayloads:
                 finally:
                     os.close(descriptor)
             except OSError as error:
+                shared.closed = isinstance(error, PermissionError)
                 self._count("maps_failed")
                 _log.info("payload %s of shard %s cannot be mapped: %s", file, shard, error)
                 return None

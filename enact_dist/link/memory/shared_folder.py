@@ -16,6 +16,9 @@ Rules that a change must keep:
 - The shard writes the nonce after taking the lock and before sending the folder's name.
 - Only the owner, root, and the group of a deliberately configured root may enter.
 - The group may not list the folder, so that only a draft's client knows the draft's name.
+- In a cell with rights the group may use the socket alone: a file has no rights per datum, and who
+  has mapped a draft for writing can change it after its commit.  So the data of other users travel
+  as messages.
 """
 
 from __future__ import annotations
@@ -70,6 +73,7 @@ class FolderAccess(NamedTuple):
         socket_mode: Mode of a socket: connecting needs write permission.
         draft_mode: Mode of a file that clients fill.
         file_mode: Mode of a file that clients read.
+        nonce_mode: Mode of the nonce.
     """
 
     group: int | None
@@ -77,9 +81,10 @@ class FolderAccess(NamedTuple):
     socket_mode: int = 0o660
     draft_mode: int = 0o660
     file_mode: int = 0o440
+    nonce_mode: int = 0o440
 
 
-_PRIVATE: Final = FolderAccess(None, 0o700, 0o600, 0o600, 0o400)
+_PRIVATE: Final = FolderAccess(None, 0o700, 0o600, 0o600, 0o400, 0o400)
 
 
 def _open_root(root: Path, *, make: bool) -> tuple[int, FolderAccess]:
@@ -120,6 +125,12 @@ class SharedFolder:
     Folders left behind by earlier starts are deleted first.  The descriptor holds the lock that
     shows that the shard lives; the kernel releases it when the process is killed.
 
+    Args:
+        cell: Name of the cell.
+        shard: Name of the shard.
+        root: Where; None: as the environment says.
+        private: Whether only the shard's own user may use its files, in a group's folder too.
+
     Attributes:
         name: Its name below the root, for the WELCOME.
         nonce: Content of its nonce file.
@@ -131,9 +142,13 @@ class SharedFolder:
         LinkError: No folder can be made, or the root is not safe.
     """
 
-    def __init__(self, cell: str, shard: str, *, root: Path | None = None) -> None:
+    def __init__(
+        self, cell: str, shard: str, *, root: Path | None = None, private: bool = False
+    ) -> None:
         root = root or shared_root()
         opened, access = _open_root(root, make=True)
+        if private:
+            access = access._replace(draft_mode=0o600, file_mode=0o400)
         try:
             _sweep(opened, root)
             parts = (cell[:PART_CHARACTERS_MAX], shard[:PART_CHARACTERS_MAX])
@@ -153,9 +168,9 @@ class SharedFolder:
 
     def _write_nonce(self) -> None:
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
-        written = os.open(NONCE, flags, self.access.file_mode, dir_fd=self.descriptor)
+        written = os.open(NONCE, flags, self.access.nonce_mode, dir_fd=self.descriptor)
         try:
-            os.fchmod(written, self.access.file_mode)
+            os.fchmod(written, self.access.nonce_mode)
             os.write(written, self.nonce)
         finally:
             os.close(written)

@@ -24,7 +24,8 @@ from enact_dist.errors import LinkError
 _CREDENTIALS: Final = struct.Struct("iII")
 _SO_PEERGROUPS: Final = 59
 _SO_PEERPIDFD: Final = 77  # Linux 6.5; also works across containers
-GROUPS_MAX: Final = 1024
+GROUPS_MAX: Final = 256
+"""Python takes at most 1,024 bytes of an option; a process with more groups has only its first."""
 LINGER_S: Final = 5.0
 """A process closes its connections a moment before the kernel reports its end."""
 JOIN_S: Final = 0.5
