@@ -16,6 +16,7 @@ error    two types            one aspect name with two datum types
 error    own trigger          an actor that, as bound, writes what triggers it
 error    two writers          two actors that write one slot, not both declaring it as `shared`
 error    rights stale         `rights.toml` differs from what the actors declare, or is missing
+error    right missing        an actor declares what no rule gives to it (`default = "none"`)
 warning  entity unsaid        an actor without triggers names a pattern, and neither `cell.toml` nor
                               its class says for which entity: its `__init__` has to
 warning  unwritten trigger    a trigger that no actor writes: only a write from outside runs it
@@ -23,6 +24,7 @@ warning  unwritten read       a reading request for data that no actor writes
 warning  set not retained     an aspect of a `Together` has no history (retention = 1): a set is
                               gone as soon as one of its slots moves on
 warning  set without stamps   a datum of a `Together` that no actor writes with a capture stamp
+warning  right unused         a rule gives actors what none of them declares
 warning  unused aspect        `cell.toml` configures an aspect that no actor names: misspelt?
 advice   durable stream       data that are written ten times a second or more, each forced to the
                               disk as nothing says how durable they are
@@ -40,10 +42,11 @@ import inspect
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Literal
 
+from enact_dist.actor.granted import differences
 from enact_dist.actor.running.doing import raised
 from enact_dist.actor.running.load import check_every_s, load_class, read_options
 from enact_dist.actor.uses import ActorDeclaration, declared_rights, uses_of
-from enact_dist.config.rights import RIGHTS_FILE, text_of_declared
+from enact_dist.config.rights import text_of_declared
 from enact_dist.config.table import suggestion
 from enact_dist.core.protocol.datum_types import newest, type_conflict
 from enact_dist.core.protocol.messages import AspectEntry
@@ -137,7 +140,9 @@ def check_cell(config: CellConfig, *, initial: Collection[str] = ()) -> tuple[Ac
     )
     findings += _sets(actors, {entry.name: entry for entry in config.aspect_entries()})
     if len(actors) == len(config.actors):
-        findings += _stale_rights(config, actors)
+        for kind, actor, text in differences(config, actors):
+            level: Level = "warning" if kind == "right unused" else "error"
+            findings.append(ActorFinding(level, kind, (actor,) if actor else (), text))
     named = {
         request.aspect.name
         for actor in actors
@@ -193,21 +198,6 @@ def rights_text(config: CellConfig) -> str:
     if findings:
         raise ConfigError(findings[0].text, path=str(config.path))
     return text_of_declared(declared_rights(actors))
-
-
-def _stale_rights(config: CellConfig, actors: Sequence[ActorDeclaration]) -> Iterator[ActorFinding]:
-    """Find a `rights.toml` that does not say what the actors declare."""
-    if config.rights is None or config.rights.default != "declared" or not actors:
-        return
-    file = config.path.parent / RIGHTS_FILE
-    try:
-        found = file.read_text("utf-8")
-    except OSError:
-        found = ""
-    if found != text_of_declared(declared_rights(actors)):
-        what = "differs from what the actors declare" if found else "is missing"
-        text = f"{file} {what}; write it with enact actor check --rights, then restart the shards"
-        yield ActorFinding("error", "rights stale", (), text)
 
 
 def _of_options(actor_class: type[Actor], options: Mapping[str, object]) -> type[Actor]:

@@ -30,7 +30,7 @@ WORLD: Final = "bench"
 """The world context that all benches write into; made if it does not exist."""
 EMBEDDED: Final = "embedded"
 CARRIER_VARIABLE: Final = "ENACT_CARRIER"
-WORKER: Final = "enact_dist.bench.cases.worker"
+WORKER: Final = "enact_dist.bench.worker"
 PIPELINE_WORKER: Final = "enact_dist.bench.cases.pipeline_worker"
 WORKERS_S: Final = 120.0
 """Many processes that start at once on few processors take this long at most."""
@@ -261,7 +261,7 @@ class Place:
 
     @contextlib.contextmanager
     def worker(self, role: str, *, carrier: str, **options: Any) -> Iterator[LineProcess]:
-        """Run `enact_dist.bench.cases.worker` in a role; it has said ``ready:``."""
+        """Run `enact_dist.bench.worker` in a role; it has said ``ready:``."""
         with self.workers([(role, options)], carrier=carrier) as (process,):
             yield process
 

@@ -142,6 +142,11 @@ class RightsConfig:
     observe: tuple[str, ...] = ("*",)
     allow: Annotated[tuple[AllowTable, ...], TableKey(table=AllowTable)] = ()
 
+    def members(self, group: str) -> tuple[str, ...]:
+        """Return the names of a group; none if there is no such group."""
+        found = self.groups.get(group)
+        return tuple(map(str, found)) if isinstance(found, list) else ()
+
     def names(self, actors: Iterable[str], operators: Iterable[str]) -> frozenset[str]:
         """Return the names that rules may mention."""
         users = (name for name in self.uids.values() if not name.startswith("@"))
@@ -212,16 +217,12 @@ def compiled_rights(
     rules.append(Rule(rights.observe, ((PLAIN_RIGHTS[-1], ALL),)))
     return Rights(
         rules,
-        groups={name: tuple(map(str, _listed(found))) for name, found in rights.groups.items()},
+        groups={name: rights.members(name) for name in rights.groups},
         operators=operators,
         users={int(uid): name for uid, name in rights.uids.items()},
         known=rights.names(actors, operators),
         hint=f"[rights] of {path.name}",
     )
-
-
-def _listed(found: object) -> list[object]:
-    return list(found) if isinstance(found, list) else []
 
 
 def read_declared(file: Path) -> tuple[AllowTable, ...]:

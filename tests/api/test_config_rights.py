@@ -189,3 +189,38 @@ def test_declared_rights_are_written_read_and_found_stale(tmp_path, capsys, monk
     file.write_text("allow = 3", "utf-8")
     with pytest.raises(ConfigError, match="cannot be used"):
         parsed(cell, tmp_path).shard_settings("s")
+
+
+def test_missing_and_unused_rights_are_found(tmp_path, capsys, monkeypatch):
+    """The rule to add can be pasted; what cannot be judged is not reported."""
+    monkeypatch.delenv("ENACT_CARRIER", raising=False)
+    (tmp_path / "arms.py").write_text(
+        "from enact_dist import *\n"
+        "class Arm(Actor):\n"
+        '    joints = Write(World("now"), Entity("arm"), Aspect("joints", int))\n'
+        '    plan = View(World("now"), Entity("plan"), Aspect("path", int))\n'
+        "    every_s = 1.0\n"
+        "    def update(self, lock): pass\n",
+        "utf-8",
+    )
+    file = tmp_path / "cell.toml"
+    head = (
+        CELL.partition("[actors.")[0]
+        + '[actors.arm]\nclass = "arms:Arm"\nworlds = { now = "online" }\n'
+        + '[rights]\ndefault = "none"\nprograms = ["logger"]\n[rights.groups]\narms = ["arm"]\n'
+        + '[[rights.allow]]\nwho = ["@arms"]\nread = "online:arm/joints"\n'
+    )
+    other = '[[rights.allow]]\nwho = "arm"\nchange = ["online:pallet/joints"]\n'
+    unjudged = '[[rights.allow]]\nwho = ["arm", "logger"]\nread = "online:logs/**"\n'
+    file.write_text(head + other + unjudged, "utf-8")
+    check = ["actor", "check", "--cell", str(file)]
+
+    assert main(check) == 1
+    told = capsys.readouterr().out
+    assert "error: right missing: actor arm declares data that no rule gives to it" in told
+    assert "gives change of online:pallet/joints to arm, and none of them declares it" in told
+    assert told.count("right unused") == 1
+    pasted = told[told.index("[[rights.allow]]\nwho = ") :].partition("warning:")[0]
+    file.write_text(head + unjudged + pasted, "utf-8")
+    assert main(check) == 0
+    assert "right" not in capsys.readouterr().out.partition("unwritten")[0]

@@ -305,7 +305,7 @@ def test_daemons_of_a_killed_bench_end(tmp_path):
     )
     try:
         deadline_s = time.monotonic() + 60
-        while not processes_of(tmp_path, b"enact_dist.bench.cases.worker"):  # its shard serves
+        while not processes_of(tmp_path, b"enact_dist.bench.worker"):  # its shard serves
             assert time.monotonic() < deadline_s
             time.sleep(0.01)
         assert processes_of(tmp_path, b"shard")

@@ -134,7 +134,10 @@ def _write_rights(config: CellConfig) -> None:
 
     file = config.path.parent / RIGHTS_FILE
     file.write_text(rights_text(config), "utf-8")
-    print(f"written: {file}; restart the shards so that they read it", file=sys.stderr)
+    print(
+        f"written: {file}; run enact shard reload --all, or start the shards, so that they read it",
+        file=sys.stderr,
+    )
 
 
 def _draw(config: CellConfig, file: Path) -> None:

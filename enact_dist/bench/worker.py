@@ -1,4 +1,4 @@
-"""A process beside the measuring one: `python -m enact_dist.bench.cases.worker CELL ROLE OPTIONS`.
+"""A process beside the measuring one: `python -m enact_dist.bench.worker CELL ROLE OPTIONS`.
 
 ========  =======================================================================================
 storer    writes an array anew at each line ``ENTITY BYTES``
