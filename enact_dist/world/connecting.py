@@ -62,7 +62,7 @@ def connect(
             has been connected (see `Cell`).
     """
     from enact_dist.link.client.joining import join
-    from enact_dist.link.zenoh.access import actor_said
+    from enact_dist.link.zenoh.access import actor_said, session_of
     from enact_dist.link.zenoh.config import OPEN_S
     from enact_dist.link.zenoh.tls import client_keys
 
@@ -77,6 +77,7 @@ def connect(
     keys = client_keys(known.security, client.actor)
     if keys is not None:
         client.actor = actor_said(keys.name, client.actor)
+        client.session = session_of(keys.name)
     cell_name, cell_client, welcome = join(
         known.name,
         known.endpoints,

@@ -16,7 +16,12 @@ from enact_dist.core.protocol import messages as m
 from enact_dist.core.protocol.datum import LockId, Position, Slot, Token
 from enact_dist.errors import EnactError, PermissionDeniedError
 from enact_dist.link.host import ShardHost
-from enact_dist.link.zenoh.access import common_name, read_revoked, split_common_name
+from enact_dist.link.zenoh.access import (
+    common_name,
+    read_revoked,
+    session_of,
+    split_common_name,
+)
 from enact_dist.terms import Access
 from enact_dist.verify.floods.raw import RawZenoh, hello
 from enact_dist.wire.keys import identity_of, token_key
@@ -26,6 +31,7 @@ pytestmark = pytest.mark.carrier("zenoh")
 
 COUNT = Aspect("count", int)
 BEN = identity_of("ben", "host", 1)
+OTHER = session_of("ben")
 PIN = '[[pins]]\nentities = "bench"\nshard = "left"\n'
 RIGHTS = """
 [rights]
@@ -98,7 +104,7 @@ def test_messages_in_the_name_of_others_reach_no_session(cell, submitted):
         connect(cell.file, actor="ada") as victim,
         RawZenoh(cell.config, keys=cell.files("ben")) as raw,
     ):
-        welcome = raw.welcome("left", "b" * 32, identity=BEN, actor="ben")
+        welcome = raw.welcome("left", session_of("ben"), identity=BEN, actor="ben")
         count = Write(victim.world("online"), Entity("bench"), COUNT)
         with Lock(count) as lock:
             lock[count] = 0
@@ -118,7 +124,7 @@ def test_messages_in_the_name_of_others_reach_no_session(cell, submitted):
                     answer = raw.ask("left", message, actor=BEN)
                     assert isinstance(answer, m.Refused), answer
                     assert answer.code == "permission"
-                    assert "ada@" in answer.text
+                    assert "belongs to ada@" in answer.text or "is none of ben" in answer.text
                     refused += 1
                 lock[count] = number + 1
         assert (silent, refused) == (30 * 9, 30 * 9)
@@ -144,7 +150,7 @@ def test_stranger_hears_and_says_nothing_with_a_key_of_its_own(cell):
         connect(cell.file, actor="ada") as victim,
         RawZenoh(cell.config, mode="client", keys=cell.files("ben")) as raw,
     ):
-        raw.welcome("left", "b" * 32, identity=BEN, actor="ben")
+        raw.welcome("left", session_of("ben"), identity=BEN, actor="ben")
         session = next(one.session for one in victim.actors() if one.actor == "ada")
         declared = [
             raw.session.declare_queryable(
@@ -175,14 +181,20 @@ def test_client_has_the_name_of_its_key(cell):
             with Lock(count) as lock:
                 lock[count] = 1
                 assert [one.actor for one in probe.actors()] == ["ada:probe"]
+            probe_session = probe.actors()[0].session
             assert probe.why("online", "bench", "count").actor == "ada:probe"
         with RawZenoh(cell.config, keys=cell.files("ben")) as raw:
-            raw.welcome("left", "b" * 32, identity=BEN, actor="ben")
+            raw.welcome("left", session_of("ben"), identity=BEN, actor="ben")
             for name in ("ada", "benn", "ada:ben", "client"):
-                answer = raw.ask("left", hello("c" * 32, actor=name), actor=BEN)
+                answer = raw.ask("left", hello(OTHER, actor=name), actor=BEN)
                 assert answer.code == "permission"
                 assert f"called itself '{name}'" in answer.text
-            assert raw.ask("left", hello("c" * 32, actor="ben:x"), actor=BEN).shard == "left"
+            assert raw.ask("left", hello(OTHER, actor="ben:x"), actor=BEN).shard == "left"
+            answer = raw.ask("right", hello(probe_session, actor="ben"), actor=BEN)
+            assert answer.code == "permission"  # nor may it greet first where the owner has not
+            assert "is none of ben" in answer.text
+            ping = raw.key("left", "ping", "ada@vm:1")
+            assert not [one for one in raw.session.get(ping, timeout=1.0) if one.ok is not None]
 
 
 def test_revoked_key_ends_its_sessions_and_lets_nobody_in(cell, capsys):

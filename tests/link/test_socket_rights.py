@@ -125,6 +125,9 @@ def test_a_user_without_an_entry_is_refused_by_number(tmp_path):
         subject_of = shard._sockets._subject_of
         assert subject_of("joe@h:1", PeerCredentials(7, 1001, 1)) == "camera"
         assert subject_of("joe@h:1", PeerCredentials(7, 1002, 1)) == "@cams"
+        assert subject_of("camera@h:1", PeerCredentials(7, 1002, 1)) == "@cams"
+        with pytest.raises(LinkError, match="called itself logger, which is another name"):
+            subject_of("logger@h:1", PeerCredentials(7, 1001, 1))
         assert subject_of("a%20b@h:1", PeerCredentials(7, 0, 0)) == "a b"
         with pytest.raises(LinkError, match="user 1003 of process 7 has no rights at shard s"):
             subject_of("camera@h:1", PeerCredentials(7, 1003, 1))

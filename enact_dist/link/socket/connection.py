@@ -12,10 +12,18 @@ import socket
 import threading
 from typing import TYPE_CHECKING, Final, Protocol
 
-from enact_dist.core.protocol.messages import Answer, Outcome, Refused, Release, Request, Survey
+from enact_dist.core.protocol.messages import (
+    Answer,
+    Hello,
+    Outcome,
+    Refused,
+    Release,
+    Request,
+    Survey,
+)
 from enact_dist.core.rights.rules import UNPROVEN, path_of
-from enact_dist.core.shard.owners import SESSION_OF, not_yours
-from enact_dist.errors import LinkError, ProtocolError
+from enact_dist.core.shard.owners import PERMISSION, SESSION_OF, not_yours
+from enact_dist.errors import LinkError, PermissionDeniedError, ProtocolError
 from enact_dist.link.answers import encoded, size_of
 from enact_dist.link.notices import Interest
 from enact_dist.link.socket.frames import (
@@ -30,6 +38,7 @@ from enact_dist.link.socket.frames import (
 )
 from enact_dist.link.socket.peers import PeerCredentials
 from enact_dist.link.socket.watcher import Publisher, SocketWatcher
+from enact_dist.link.zenoh.access import refuse_other_name
 from enact_dist.patterns import checked_patterns
 from enact_dist.wire.frames import decode_frame, decode_request
 
@@ -169,6 +178,13 @@ class SocketConnection:
                 self.step = step = step + 1
                 self._send(not_yours(session, "another connection", self.identity))
                 continue
+            if type(message) is Hello and self.subject is not None:
+                try:
+                    refuse_other_name(message.actor, self.identity)
+                except PermissionDeniedError as error:
+                    self.step = step = step + 1
+                    self._send(Refused(PERMISSION, str(error)))
+                    continue
             host.submit(message, self._take, self.identity, self.subject)
             self.step = step = step + 1
             answer, self._answer = self._answer, None

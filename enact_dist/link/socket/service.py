@@ -169,6 +169,12 @@ class SocketService:
                 f"user {peer.user} of process {peer.pid} has no rights at shard {self.host.name};"
                 f" add it to `uids`: {rights.hint}"
             )
+        trusted = peer.user in self._users or subject in rights.operators
+        if not trusted and name in rights.known and not rights.means(subject, name):
+            raise LinkError(
+                f"process {peer.pid} of user {peer.user} called itself {name}, which is another"
+                f" name of the cell; that user is {subject}: {rights.hint}"
+            )
         return subject
 
     def _problem_with(

@@ -7,8 +7,10 @@ publishes its notices and sees tokens.  They cost 15 us a call, and check only k
 shard itself checks everything else (see `enact_dist.core.shard.owners`).
 
 In a cell with keys, the rules bind the name in the key of each request and token to the name that
-the sender's certificate proves.  Names that the cell does not know may only ping, so that a client
-can tell a shard that is down from one that does not let it in.
+the sender's certificate proves.  Names that the cell does not know may only ping, without a name,
+so that a client can tell a shard that is down from one that does not let it in.  A session's id
+ends with a mark of its owner's name (`session_of`): otherwise a client could greet a shard with the
+id of another one, which listings show, before that one does.
 
 Zenoh drops forbidden messages silently: a query gets no reply, a declaration reaches no peer.  A
 query passes only if its key is *included* in an allowed one, so a query with wildcards for several
@@ -20,8 +22,11 @@ been revoked N times.  `revoked.toml` in the key folder says how often: ``camera
 
 from __future__ import annotations
 
+import hashlib
 import json
+import secrets
 import tomllib
+from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.messages import Ping
@@ -29,6 +34,7 @@ from enact_dist.core.shard.owners import shard_identity
 from enact_dist.errors import ConfigError, PermissionDeniedError
 from enact_dist.wire.keys import (
     ANY,
+    NAMELESS,
     ROOT,
     SAME_NAME,
     SHOWN_CHARACTERS,
@@ -68,10 +74,11 @@ def access_rules(
     own = queryable_key(cell, shard)
     requests = own.removesuffix("**")
     anywhere = [f"{ROOT}/{ANY}/{ANY}/{verb}/{ANY}" for verb in (verb_of(Ping()), EARLIER_QUESTION)]
+    ask = anywhere if names is None else [f"{ROOT}/{ANY}/{ANY}/{verb_of(Ping())}/{NAMELESS}"]
     tokens, notices = token_key(cell, ANY, ANY), notice_key(cell, ANY)
     rules = _Rules()
     everybody = members = [ALL_PEERS]
-    rules.add("ask", "ingress", ["query"], anywhere, everybody)
+    rules.add("ask", "ingress", ["query"], ask, everybody)
     rules.add("answers", "egress", ["reply", "declare_queryable"], [own, *anywhere], everybody)
     if names is None:
         rules.add("requests", "ingress", ["query"], [f"{requests}*/*"], everybody)
@@ -132,17 +139,34 @@ def actor_said(name: str, actor: str) -> str:
     return name if actor in {name, ""} else f"{name}:{actor}"[:NAME_CHARACTERS_MAX]
 
 
-def refuse_other_name(actor: str, identity: str) -> None:
-    """Refuse a hello in which a client calls itself by a name that is not that of its key.
+def session_of(name: str) -> str:
+    """Return a new id for a session of a name."""
+    return secrets.token_hex(12) + _mark_of(name)
+
+
+@lru_cache(maxsize=1024)
+def _mark_of(name: str) -> str:
+    return hashlib.blake2s(name.encode(), digest_size=4).hexdigest()
+
+
+def refuse_other_name(actor: str, identity: str, session: str = "") -> None:
+    """Refuse a hello in which a client calls itself by a name that is not proven.
+
+    Args:
+        actor: What it calls itself.
+        identity: With the proven name.
+        session: The id of its session, which must be one of that name; "": it may be any.
 
     Raises:
         PermissionDeniedError: It does; holders, causes and listings would name another client.
     """
     name = name_in(identity)
-    if actor != name and not actor.startswith(f"{name}:"):
+    if session and not session.endswith(_mark_of(name)):
+        raise PermissionDeniedError(f"session {session[:8]} is none of {name}; {identity} greeted")
+    said = (actor or NAMELESS)[:SHOWN_CHARACTERS]
+    if said != name and not said.startswith(f"{name}:"):
         raise PermissionDeniedError(
-            f"{identity} called itself {actor[:SHOWN_CHARACTERS]!r}; with the key of {name} it is"
-            f" {name}, or {name}: and a word of its own"
+            f"{identity} called itself {said!r}; it is {name}, or {name}: and a word of its own"
         )
 
 

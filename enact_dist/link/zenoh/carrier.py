@@ -54,7 +54,7 @@ from enact_dist.link.zenoh.queries import (
 )
 from enact_dist.link.zenoh.tls import why_refused
 from enact_dist.wire.frames import decode_frame
-from enact_dist.wire.keys import ANY, notice_key, request_key, token_key, verb_of
+from enact_dist.wire.keys import ANY, NAMELESS, notice_key, request_key, token_key, verb_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -399,8 +399,11 @@ class ZenohCarrier:
 
     def _is_barred(self, shard: str) -> bool:
         """Return whether a shard lets any key ping, but ends other queries of ours at once."""
-        if self.request(shard, QUESTION, timeout_s=REACH_S) is None:
-            return False
+        key = request_key(self._cell, shard, verb_of(QUESTION), NAMELESS)
+        with self._inside:
+            replies = send_query(self._link_to(shard).session, key, QUESTION, timeout_s=REACH_S)
+            if next_reply(replies) is None:
+                return False
         began_s = time.monotonic()
         answer = self.request(shard, ListPlaces(), timeout_s=REACH_S)
         return answer is None and time.monotonic() - began_s < REACH_S / 2

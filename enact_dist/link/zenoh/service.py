@@ -245,7 +245,7 @@ class ZenohService:
             if verb != verb_of(message):
                 raise ProtocolError(f"a {verb_of(message)} arrived on the key of a {verb}")
             if self._proven and type(message) is Hello:
-                refuse_other_name(message.actor, identity)
+                refuse_other_name(message.actor, identity, message.session)
             if (ANY in cell or ANY in shard) and type(message) is not Ping:
                 raise ProtocolError(
                     f"a {verb} was sent to several shards at once; only a ping may be"
