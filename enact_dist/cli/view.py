@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -27,6 +28,8 @@ PORT: Final = 8080
 ANSWER_S: Final = 2.0
 """How long a shard is waited for: a page goes on without one that has gone."""
 
+TOKEN_VARIABLE: Final = "ENACT_VIEW_TOKEN"  # noqa: S105 - its name
+
 
 def port(text: str) -> int:
     """Read a port, 0 for any; an `argparse` type."""
@@ -46,8 +49,9 @@ VERBS: Final = (
             option("--world", "NAME", "the context that a page begins with (default: the first)",
                    default=""),
             option("--host", "ADDRESS",
-                   "address to listen on; any but the loopback shows the cell to that network,"
-                   " without a password (default: 127.0.0.1)", default="127.0.0.1"),
+                   "address to listen on; beyond the loopback a browser needs the token that is"
+                   f" printed, or that {TOKEN_VARIABLE} has (default: 127.0.0.1)",
+                   default="127.0.0.1"),
             option("--port", "N", f"port, the next free one if it is taken (default: {PORT})",
                    type=port, default=PORT),
             many("--shows", "ASPECT=KIND",
@@ -79,8 +83,11 @@ def run_view(options: argparse.Namespace) -> int:
             options.cell = cell_target(options)
             shown = stack.enter_context(open_cell(options, actor="view"))
         viewer = stack.enter_context(Viewer(shown, _settings(options)))
-        server = stack.enter_context(ViewServer(viewer, host=options.host, port=options.port))
-        print(f"{viewer.name}: http://{options.host}:{server.port}", flush=True)
+        token = os.environ.get(TOKEN_VARIABLE)
+        server = stack.enter_context(
+            ViewServer(viewer, host=options.host, port=options.port, token=token)
+        )
+        print(f"{viewer.name}: {server.url}", flush=True)
         stop.event.wait()
     return DONE
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import io
+import secrets
 import socket
 import threading
 import warnings
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
 PORTS_TRIED: Final = 1000
 PORT_MAX: Final = 65535
+TOKEN_BYTES: Final = 16
 
 
 def require_viser() -> None:
@@ -89,20 +91,35 @@ class ViewServer(Closing):
         viewer: What they show.
         host: Address to listen on.
         port: Port; the next free one if it is taken.
+        token: What a browser has to know; None: nothing on the loopback, else a random one.
+
+    Attributes:
+        port: Port that it listens on.
+        url: Where to open it, with the token.
 
     Raises:
         ConfigError: viser is not installed, or no port of the address can be listened on.
     """
 
-    def __init__(self, viewer: Viewer, *, host: str = "127.0.0.1", port: int = 8080) -> None:
+    def __init__(
+        self,
+        viewer: Viewer,
+        *,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        token: str | None = None,
+    ) -> None:
         require_viser()
         port = free_port(host, port)
-        from enact_dist.view.pages.unshared import UnsharedServer
+        from enact_dist.view.pages.door import QUERY, Door, GuardedServer, is_loopback
+
+        if token is None:
+            token = "" if is_loopback(host) else secrets.token_urlsafe(TOKEN_BYTES)
 
         # A browser may go while its page draws: what is on its way then is no loss.
         warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
         with contextlib.redirect_stdout(io.StringIO()):  # its own table of addresses
-            self._server = UnsharedServer(host, port, label=viewer.name, verbose=False)
+            self._server = GuardedServer(host, port, door=Door(host, token), label=viewer.name)
         self._server.gui.configure_theme(
             show_share_button=False, show_logo=False, control_width="large"
         )
@@ -121,6 +138,9 @@ class ViewServer(Closing):
         self._server.on_client_connect(self._open)
         self._server.on_client_disconnect(self._close)
         self.port = self._server.get_port()
+        self.url = f"http://{f'[{host}]' if ':' in host else host}:{self.port}"
+        if token:
+            self.url += f"/?{QUERY}={token}"
 
     def _open(self, client: ClientHandle) -> None:
         page = Page(self._viewer, client)
