@@ -131,7 +131,7 @@ class RightsConfig:
         uids: Whose rights the processes of a user of a host have, by the user's number.
         groups: Names, or names with stars, of each group.
         programs: Names, beside those of the actors, that rules may mention.
-        observe: Who may list what the cell has and who holds it.
+        observe: Who may list sessions, locks, causes and the audit.
         allow: The rules.
     """
 

@@ -10,13 +10,16 @@ from enact_dist.access.asking import answers_to, ask_all
 from enact_dist.core.protocol.messages import (
     NO_LIMIT,
     ListSessions,
+    Refused,
     Sessions,
     Survey,
     Surveyed,
     Welcome,
 )
+from enact_dist.core.shard.owners import PERMISSION
 from enact_dist.core.state.retention import limits_of
 from enact_dist.errors import LinkError
+from enact_dist.link.refusals import error_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -330,9 +333,20 @@ def _asked_info(client: CellClient, shard: str) -> ShardInfo:
     started_s = time.monotonic()
     answer = client.call_once([question])[0]
     round_trip_s = time.monotonic() - started_s
+    raise_denied(answer)
     if not isinstance(answer, Sessions):
         return _silent(client, shard, endpoint)
     return answered_info(client, shard, answer, round_trip_s)
+
+
+def raise_denied(answer: Answer | None) -> None:
+    """Raise if a shard answers, and this client has no right to ask that.
+
+    Raises:
+        PermissionDeniedError: It has none; a listing would otherwise show the shard as away.
+    """
+    if isinstance(answer, Refused) and answer.code == PERMISSION:
+        raise error_of(answer)
 
 
 def _silent(client: CellClient, shard: str, endpoint: str) -> ShardInfo:

@@ -29,6 +29,7 @@ from enact_dist.world.listings import (
     actor_infos,
     answered_info,
     lock_info,
+    raise_denied,
 )
 
 if TYPE_CHECKING:
@@ -133,6 +134,7 @@ def _answers(
                 problems[shard] = str(error)
                 found.append(None)
     for (shard, _), answer in zip(calls, found, strict=True):
+        raise_denied(answer)
         if isinstance(answer, Refused):
             problems[shard] = answer.text
     return found

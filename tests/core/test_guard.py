@@ -96,10 +96,8 @@ def requests(bench):
         "break": ({"break_": "**"}, m.Break(7, "why", bench.shard.epoch)),
         "abort": ({"resolve": "**"}, m.ForceAbort(7, "why", bench.shard.epoch)),
         "settle": ({"resolve": "**"}, m.ListAudit("settled")),
-        "survey": ({"observe": "**"}, m.Survey((), (), ())),
         "locks": ({"observe": "**"}, m.ListLocks()),
         "sessions": ({"observe": "**"}, m.ListSessions()),
-        "history": ({"observe": "**"}, m.ListHistory((), (), ())),
         "explain": ({"observe": "**"}, m.Explain(())),
         "effects": ({"observe": "**"}, m.FindEffects(())),
         "audit": ({"observe": "**"}, m.ListAudit("")),
@@ -231,6 +229,11 @@ def test_listings_leave_out_what_is_not_readable():
     asked = tuple(m.SlotVersion(slot(entity), 1) for entity in ("secret", "piece"))
     assert len(bench.asked(m.Explain(asked)).entries) == 1
     assert len(bench.ask(m.Survey((), (), ())).states) == 2
+    for alone in (
+        m.Explain((m.SlotVersion(slot("secret"), 1),)),
+        m.ListHistory(("online",), ("secret",), ("count",)),
+    ):
+        assert refused(bench.asked(alone), "read", "online:secret/count")
 
 
 def test_a_large_datum_is_fetched_by_a_reader_or_under_its_own_lock():

@@ -10,12 +10,13 @@ request                                  right
 `Register`                               `write` somewhere of each aspect; `register` of new worlds
 `Fork`, `DropWorld`, `KeepVersions`      `fork` and `read` of the whole source; `drop`; `keep`
 `Break`; `ForceAbort`, settled alarms    `break`; `resolve`
-`Survey`, `ListHistory`, `Explain`,      `observe`; what is not readable is left out
-`FindEffects`
+`Survey`, `ListHistory`                  none; what is not readable is left out
+`Explain`, `FindEffects`                 `observe`; what is not readable is left out
 `ListLocks`, `ListSessions`,             `observe`
 `ListAudit`
 =======================================  =======================================================
 
+A question about one slot alone is refused without `read` of it: it would look like null otherwise.
 Everything else needs none: the owner of a session may renew, release and end, and shards are known
 by their own identity (`enact_dist.core.shard.owners`).  Locks are refused before they get a place
 in the queue.  A commit is compared again behind its fence, since a client may send anything.
@@ -42,7 +43,6 @@ from enact_dist.core.protocol.messages import (
     Refused,
     Register,
     Stage,
-    Survey,
     TakeView,
 )
 from enact_dist.core.protocol.records import Story
@@ -60,9 +60,7 @@ TOLD_EACH_NS: Final = 1_000_000_000
 """The log names a subject and a right at most once in this time."""
 TOLD_MAX: Final = 1_000
 """Subjects and rights that are remembered for that; with one more, all of them are forgotten."""
-_OBSERVING: Final = frozenset(
-    (Survey, ListLocks, ListSessions, ListHistory, Explain, FindEffects, ListAudit)
-)
+_OBSERVING: Final = frozenset((ListLocks, ListSessions, Explain, FindEffects, ListAudit))
 
 
 class SlotContents(Protocol):
@@ -121,7 +119,10 @@ class Guard:
             return self._plain("resolve", ALL, "locks and alarms")
         if kind is Stage and not self.rights.may_write_some(self.subject, ALL):
             return self.denied(WRITE, "anything")
-        return self._plain("observe", ALL, "the cell") if kind in _OBSERVING else None
+        if kind in _OBSERVING and (refused := self._plain("observe", ALL, "the cell")) is not None:
+            return refused
+        alone = _asked_alone(message)
+        return self.may_not_read(alone) if alone is not None else None
 
     def _plain(self, right: str, path: str, what: str) -> Refused | None:
         may = self.rights.may(self.subject, right, path)
@@ -200,6 +201,19 @@ class Guard:
             asker = f" (asked by {self.asker})" if refused.code == DENIED and self.asker else ""
             yield Story("permission.denied", f"{refused.text}{asker}{more}")
         self.denials.clear()
+
+
+def _asked_alone(message: object) -> Slot | None:
+    """Return the slot that a question is about, if it is about one alone."""
+    if isinstance(message, Explain):
+        slots = {slot for slot, _ in message.versions}
+        return slots.pop() if len(slots) == 1 else None
+    if isinstance(message, ListHistory):
+        asked = (message.contexts, message.patterns, message.aspects)
+        if all(len(some) == 1 and "*" not in some[0] for some in asked):
+            ((context,), (entity,), (aspect,)) = asked
+            return Slot(context, entity, aspect)
+    return None
 
 
 def shown(slot: Slot) -> str:

@@ -17,7 +17,7 @@ right        path                                  gives
 `keep`       ``LABEL``                             to pin versions under a label, and to unpin them
 `break`      anything                              to break locks
 `resolve`    anything                              to abort prepared locks, to settle alarms
-`observe`    anything                              to list what is there and who holds it
+`observe`    anything                              to list who is there and holds what, and causes
 ===========  ====================================  ===============================================
 
 `write` is not in the table: it stands for `change`, `init` and `delete` together, and a request for
