@@ -42,6 +42,7 @@ FOLLOWED = {
     "operations.md",
     "own_actors.md",
     "protocol.md",
+    "securing.md",
     "drills.md",
 }
 """Pages whose consoles are followed in `tests/e2e`."""

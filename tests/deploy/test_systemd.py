@@ -54,6 +54,24 @@ def test_systemd_finds_nothing_wrong_with_a_unit(analyze, kind, tmp_path):
     assert (done.returncode, done.stderr) == (0, "")
 
 
+def test_an_actor_may_have_a_user_and_keys_of_its_own(analyze, tmp_path):
+    """The drop-in replaces the shared user, and each folder has the name of its actor."""
+    copy = tmp_path / unit("actor").name
+    copy.write_text(unit("actor").read_text("utf-8").replace("/opt/enact/bin/enact", "/bin/true"))
+    text = (UNITS / "own_user.conf").read_text("utf-8")
+    for name, said in (("own_user", text), ("wrong", text.replace("RuntimeDirectory=", "Runs="))):
+        folder = tmp_path / "enact-actor@.service.d"
+        folder.mkdir(exist_ok=True)
+        (folder / "own_user.conf").write_text(said)
+        done = analyze("verify", str(tmp_path / "enact-actor@fusion.service"))
+        assert ("Runs" in done.stderr) == (name == "wrong"), done.stderr
+        if name == "own_user":
+            assert (done.returncode, done.stderr) == (0, "")
+    settings = re.findall(r"^(User|Environment|RuntimeDirectory)=(.*)$", text, re.MULTILINE)
+    assert len(settings) == 4
+    assert all(value.endswith("%i") for _, value in settings)
+
+
 def test_a_misspelt_key_of_a_unit_is_found(analyze, tmp_path):
     """The check above bites."""
     text = unit("shard").read_text("utf-8").replace("/opt/enact/bin/enact", "/bin/true")

@@ -39,6 +39,16 @@ def test_a_long_page_does_what_it_says(page, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.carrier("zenoh")
+def test_a_cell_is_secured_as_its_page_says(tmp_path):
+    """It gets keys and rights, and what must fail does."""
+    pytest.importorskip("cryptography", reason="making keys needs the extra 'keys'")
+    if shutil.which("openssl") is None:
+        pytest.skip("openssl: command not found (Debian package openssl)")
+    follow(DOCS / "securing.md", tmp_path)
+
+
+@pytest.mark.slow
 @pytest.mark.carrier("auto")
 def test_the_project_of_ones_own_runs(tmp_path):
     """From a copy of its folder, as its page says."""

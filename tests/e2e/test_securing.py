@@ -1,5 +1,6 @@
 """A running cell of two hosts gets keys, then rights, one host after the other."""
 
+import itertools
 import shutil
 import signal
 import threading
@@ -119,7 +120,7 @@ class Updates:
     def longest_s(self, since):
         """Return the longest time between two updates after the first `since`."""
         times = self.times[max(0, since - 1) :]
-        return max(b - a for a, b in zip(times, times[1:], strict=False))
+        return max(b - a for a, b in itertools.pairwise(times))
 
     def end(self):
         self._ended.set()
