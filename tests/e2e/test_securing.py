@@ -138,6 +138,20 @@ def cell_file(ports, scheme="tcp", security="", rights=""):
     return "\n".join(lines) + rights
 
 
+def make_keys(office, text, hosts, monkeypatch):
+    """Make all keys in one place, and copy to each host those of the names that run there."""
+    office.mkdir()
+    (office / "cell.toml").write_text(text)
+    monkeypatch.chdir(office)
+    for verb in ("init", "make"):
+        assert main(["cell", "keys", verb]) == 0
+    for name, host in hosts.items():
+        (host.folder / "keys").mkdir(mode=0o700)
+        names = (f"shard.{name}", HOSTS[name], *(("carrier",) if name == "left" else ()))
+        for file in ("ca.pem", *(f"{one}.{end}" for one in names for end in ("crt", "key"))):
+            shutil.copy2(office / "keys" / file, host.folder / "keys" / file)
+
+
 def test_a_running_cell_gets_keys_and_rights_host_after_host(tmp_path, monkeypatch):
     """No acknowledged update is lost; each host's interruption is its restart and a lease."""
     ports = {name: free_port() for name in HOSTS}
@@ -160,18 +174,7 @@ def test_a_running_cell_gets_keys_and_rights_host_after_host(tmp_path, monkeypat
         for one in updates.values():
             one.go_on()
 
-        office = tmp_path / "office"
-        office.mkdir()
-        (office / "cell.toml").write_text(cell_file(ports, "tls", security))
-        monkeypatch.chdir(office)
-        for verb in ("init", "make"):
-            assert main(["cell", "keys", verb]) == 0
-        for name, host in hosts.items():
-            (host.folder / "keys").mkdir(mode=0o700)
-            names = (f"shard.{name}", HOSTS[name], *(("carrier",) if name == "left" else ()))
-            for file in ("ca.pem", *(f"{one}.{end}" for one in names for end in ("crt", "key"))):
-                shutil.copy2(office / "keys" / file, host.folder / "keys" / file)
-
+        make_keys(tmp_path / "office", cell_file(ports, "tls", security), hosts, monkeypatch)
         for step, text, anew in (
             ("keys", cell_file(ports, "tls", security), True),
             ("rights", cell_file(ports, "tls", security, RIGHTS), False),
