@@ -9,6 +9,7 @@ from enact_dist.core.protocol.messages import (
     Audited,
     Granted,
     Locks,
+    Refusals,
     Registered,
     Sessions,
     Slice,
@@ -81,4 +82,5 @@ _SIZE_OF: Final[dict[type, Callable[[Any], int]]] = {
     Locks: lambda answer: bytes_in_frame(answer.holders),
     Sessions: lambda answer: bytes_in_frame(answer.sessions + answer.aspects),
     Audited: lambda answer: bytes_in_frame(answer.entries),
+    Refusals: lambda answer: bytes_in_frame(answer.entries),
 }

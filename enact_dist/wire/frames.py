@@ -75,6 +75,7 @@ CODES: Final[dict[type[Any], int]] = {
     m.KeepVersions: 28,
     m.Ping: 29,
     m.ListPlaces: 30,
+    m.ListRefusals: 31,
     m.Welcome: 33,
     m.Registered: 34,
     m.Granted: 35,
@@ -110,6 +111,7 @@ CODES: Final[dict[type[Any], int]] = {
     m.Kept: 65,
     m.Pong: 66,
     m.Places: 67,
+    m.Refusals: 68,
     m.Notice: 97,
 }
 

@@ -19,11 +19,9 @@ from enact_dist.access.session import Session
 from enact_dist.access.watch import Closing
 from enact_dist.core.protocol.datum import Position
 from enact_dist.core.protocol.messages import (
-    Audited,
     Break,
     Broken,
     ForceAbort,
-    ListAudit,
     ListLocks,
     ListSessions,
     Locks,
@@ -43,11 +41,16 @@ from enact_dist.world.listings import (
     AspectInfo,
     AuditInfo,
     LockInfo,
+    RefusalInfo,
     ShardInfo,
     actor_infos,
     aspect_infos,
+    audit_infos,
     lock_info,
+    lock_infos,
+    refusal_infos,
     sessions_named,
+    settle_alarms,
     shard_info,
 )
 from enact_dist.world.look import Look, look_at
@@ -325,11 +328,7 @@ class Cell(FormerNames, Closing):
         Raises:
             ShardUnreachableError: A shard does not answer.
         """
-        return tuple(
-            lock_info(shard, holder)
-            for shard, answer in ask_all(self._client, Locks, ListLocks(), shards)
-            for holder in answer.holders
-        )
+        return lock_infos(self._client, shards)
 
     def break_lock(self, number: int, *, shard: str, reason: str = "") -> LockInfo | None:
         """Take a lock away from its holder, who learns the reason; the shard audits the act.
@@ -368,12 +367,15 @@ class Cell(FormerNames, Closing):
         Raises:
             ShardUnreachableError: A shard does not answer.
         """
-        found = [
-            AuditInfo(shard, entry.wall_ns / 1e9, entry.kind, entry.text, entry.identity)
-            for shard, answer in ask_all(self._client, Audited, ListAudit(""), shards)
-            for entry in answer.entries
-        ]
-        return tuple(sorted(found, key=lambda entry: entry.stamp_s))
+        return audit_infos(self._client, shards)
+
+    def refusals(self, shards: Iterable[str] | None = None) -> tuple[RefusalInfo, ...]:
+        """Return the rights that clients lacked since each shard's start; `shards` as in `locks`.
+
+        Raises:
+            ShardUnreachableError: A shard does not answer.
+        """
+        return refusal_infos(self._client, shards)
 
     def acknowledge_alarms(self, *, shard: str, how: str) -> None:
         """Acknowledge all alarms of a shard so far; the shard audits the act.
@@ -386,9 +388,7 @@ class Cell(FormerNames, Closing):
             raise MisuseError("how= is empty: state how the alarms were settled")
         check_reason("how", how)
         self._check_shard(shard)
-        ((_, seen),) = ask_all(self._client, Audited, ListAudit(""), (shard,))
-        newest_ns = max((entry.wall_ns for entry in seen.entries), default=0)
-        self._client.call(shard, ListAudit(how, newest_ns))
+        settle_alarms(self._client, shard, how)
 
     def _check_shard(self, shard: str) -> None:
         if shard not in self._client.shards():

@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING, Any, Final
 from enact_dist.access.asking import answers_to, ask_all
 from enact_dist.core.protocol.messages import (
     NO_LIMIT,
+    Audited,
+    ListAudit,
+    ListLocks,
+    ListRefusals,
     ListSessions,
+    Locks,
+    Refusals,
     Refused,
     Sessions,
     Survey,
@@ -233,6 +239,67 @@ class AuditInfo:
     kind: str
     text: str
     identity: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class RefusalInfo:
+    """A right that a client of a shard lacked.
+
+    Attributes:
+        shard: The shard that refused.
+        identity: Whose rights the requests used; "-" for clients whose names are not proven.
+        right: The right that was missing; "write" if any of its parts would have sufficed.
+        what: On what, as rules in `cell.toml` name it, such as "online:plan/*/joints".
+        count: How often, since the shard's start.
+        first_s: When first, by the shard's wall clock, seconds since 1970.
+        last_s: When last.
+    """
+
+    shard: str
+    identity: str
+    right: str
+    what: str
+    count: int
+    first_s: float
+    last_s: float
+
+
+def lock_infos(client: CellClient, shards: Iterable[str] | None) -> tuple[LockInfo, ...]:
+    """Return all locks of some shards (None: all), oldest first within each."""
+    return tuple(
+        lock_info(shard, holder)
+        for shard, answer in ask_all(client, Locks, ListLocks(), shards)
+        for holder in answer.holders
+    )
+
+
+def audit_infos(client: CellClient, shards: Iterable[str] | None) -> tuple[AuditInfo, ...]:
+    """Return the acts of operators at some shards (None: all), oldest first."""
+    found = [
+        AuditInfo(shard, entry.wall_ns / 1e9, entry.kind, entry.text, entry.identity)
+        for shard, answer in ask_all(client, Audited, ListAudit(""), shards)
+        for entry in answer.entries
+    ]
+    return tuple(sorted(found, key=lambda entry: entry.stamp_s))
+
+
+def settle_alarms(client: CellClient, shard: str, how: str) -> None:
+    """Acknowledge all alarms of a shard so far."""
+    ((_, seen),) = ask_all(client, Audited, ListAudit(""), (shard,))
+    newest_ns = max((entry.wall_ns for entry in seen.entries), default=0)
+    client.call(shard, ListAudit(how, newest_ns))
+
+
+def refusal_infos(client: CellClient, shards: Iterable[str] | None) -> tuple[RefusalInfo, ...]:
+    """Return the rights that clients of some shards (None: all) lacked."""
+    return tuple(
+        RefusalInfo(
+            shard, one.subject, one.right, one.what, one.times,
+            one.first_ns / 1e9, one.last_ns / 1e9,
+        )
+        for shard, answer in ask_all(client, Refusals, ListRefusals(), shards)
+        for one in answer.entries
+    )  # fmt: skip
 
 
 def actor_infos(answers: Iterable[tuple[str, Answer | None]]) -> tuple[ActorInfo, ...]:

@@ -32,6 +32,7 @@ from enact_dist.core.protocol.messages import (
     ListHistory,
     ListLocks,
     ListPlaces,
+    ListRefusals,
     ListSessions,
     Outcome,
     Ping,
@@ -248,7 +249,7 @@ def catalogue_and_people(cell: RepeatingCell) -> None:
     ann.call("s0", AwaitStamp(lock.position.stamp_ns, 0))
     ann.call("s0", AwaitStamp(WALL_NS + 100 * S, 0))
     listings = (ListPlaces(), Survey((), (), ()), ListLocks(), ListSessions(), ListAudit(""))
-    for request in (Ping(), *listings):
+    for request in (Ping(), ListRefusals(), *listings):
         ann.call("s0", request)
 
 

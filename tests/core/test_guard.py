@@ -11,6 +11,7 @@ from enact_dist.core.protocol import messages as m
 from enact_dist.core.protocol.datum import Token
 from enact_dist.core.protocol.messages import Hello, Refused, WriteItem
 from enact_dist.core.protocol.records import Recovered
+from enact_dist.core.rights.guard import NOTED_MAX
 from enact_dist.core.rights.rules import Rights, Rule, data_path
 from enact_dist.core.shard.shard import Shard
 from enact_dist.terms import Access
@@ -278,3 +279,23 @@ def test_the_log_names_a_subject_and_a_right_once_a_second():
     assert len(told) == 3
     assert told[2].endswith("4 more since the last line")
     assert bench.counter("permission_denied") == 7
+
+
+def test_refusals_can_be_listed_by_those_who_may_observe():
+    bench = GuardedBench()
+    for _ in range(3):
+        bench.asked(m.Break(7, "why", bench.shard.epoch))
+    assert isinstance(bench.asked(m.ListRefusals()), Refused)
+    (broke, listed) = bench.ask_as("ada@h:1", m.ListRefusals()).entries
+    assert broke[:4] == ("cam", "break", "locks", 3)
+    assert listed[:4] == ("cam", "observe", "the cell", 1)
+    assert 0 < broke.first_ns <= broke.last_ns
+
+
+def test_of_more_refusals_than_are_kept_the_latest_stay():
+    bench = GuardedBench()
+    for number in range(NOTED_MAX + 2):
+        bench.asked(m.DropWorld("cam", f"w{number % (NOTED_MAX + 1)}", bench.shard.epoch))
+    found = bench.ask_as("ada@h:1", m.ListRefusals()).entries
+    assert len(found) == NOTED_MAX
+    assert (found[0].what, found[-1].what, found[-1].times) == ("w2", "w0", 1)

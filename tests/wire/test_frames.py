@@ -75,6 +75,7 @@ def test_frame_codes_stand_still():
         ("EpochChanged", 52), ("WrongShard", 53), ("Refused", 54), ("Changed", 55),
         ("ForceAbort", 20), ("ListAudit", 21), ("Stage", 22), ("Audited", 59), ("Staged", 60),
         ("Ping", 29), ("Pong", 66), ("ListPlaces", 30), ("Places", 67),
+        ("ListRefusals", 31), ("Refusals", 68),
         ("Notice", 97),
     }  # fmt: skip
 

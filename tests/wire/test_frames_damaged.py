@@ -146,7 +146,7 @@ def test_frame_of_another_version_names_both_versions():
             decode_frame(msgpack.packb([other, *rest, 0]))
 
 
-@pytest.mark.parametrize("code", [0, 31, 32, 96, 127, 255, 1 << 40, -1, "3", None, 1.0, True])
+@pytest.mark.parametrize("code", [0, 32, 96, 127, 255, 1 << 40, -1, "3", None, 1.0, True])
 def test_frame_of_unknown_code_is_refused(code):
     """A code that this version does not know is named."""
     with pytest.raises(ProtocolError, match="unknown code"):

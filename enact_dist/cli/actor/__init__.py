@@ -17,6 +17,7 @@ from enact_dist.cli.arguments import (
     pair,
     seconds_of,
 )
+from enact_dist.cli.text.times import span
 from enact_dist.cli.verbs import LOOKS, Verb, flag, many, option
 
 _NAME: Final = option("name", "NAME", "name of the actor, as enact actor ls shows it")
@@ -87,7 +88,8 @@ VERBS: Final = (
     Verb(
         "check", "check all declared reads and writes of the cell's actors, without running any",
         "actor:check_actors",
-        "enact actor check --cell cell.toml\nenact actor check --graph cell.svg",
+        "enact actor check --cell cell.toml\nenact actor check --graph cell.svg\n"
+        "enact actor check --learn 10min",
         (
             CELL_FILE,
             JSON,
@@ -98,6 +100,10 @@ VERBS: Final = (
                     " running cell, with the rate of each actor"),
             flag("--rights", "write rights.toml beside the cell.toml: what each actor may read and"
                  " write by its declaration"),
+            option("--learn", "TIME",
+                   "in a running cell with [rights], collect what is refused in this time (such as"
+                   " 10min), and print the rules that would allow it; 0: what its shards have"
+                   " refused so far", type=span),
         ),
     ),
 )  # fmt: skip

@@ -106,6 +106,10 @@ def check_actors(options: argparse.Namespace) -> int:
     from enact_dist.actor.check import check_cell
 
     config = cell_config(options)
+    if options.learn is not None:
+        from enact_dist.cli.actor.learn import learn
+
+        return learn(config, options)
     see_modules(config.path)
     if options.rights:
         _write_rights(config)

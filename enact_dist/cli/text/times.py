@@ -30,6 +30,7 @@ MOMENT_HELP: Final = (
 )
 _SECONDS: Final = {"ms": 0.001, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 _AGO: Final = re.compile(r"-(\d+(?:\.\d+)?)(ms|s|min|h|d)\Z")
+_SPAN: Final = re.compile(r"(\d+(?:\.\d+)?)(ms|s|min|h|d)?\Z")
 _POSITION: Final = re.compile(r"(\d+)@(\S+)\Z")
 _STAMP_DIGITS_MIN: Final = 16
 """A whole number of so many digits is a stamp; as seconds it would lie 30 million years ahead."""
@@ -57,6 +58,16 @@ def moment(text: str) -> When:
         return datetime.fromisoformat(text).astimezone()
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is no moment; give {MOMENT_HELP}") from None
+
+
+def span(text: str) -> float:
+    """Read a time such as 10min, or a number of seconds, 0 included; an `argparse` type."""
+    found = _SPAN.match(text.strip())
+    if not found:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no time; give seconds, or a number and ms, s, min, h or d, such as 10min"
+        )
+    return float(found[1]) * _SECONDS[found[2] or "s"]
 
 
 def shown_position(position: Position) -> str:

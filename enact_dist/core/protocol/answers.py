@@ -15,6 +15,7 @@ from enact_dist.core.protocol.parts import (
     GrantLeft,
     Holder,
     PlacementMap,
+    RefusalEntry,
     SessionInfo,
     ShardEntry,
     SlotState,
@@ -341,6 +342,13 @@ class Audited:
 
 
 @message
+class Refusals:
+    """Which rights clients lacked, the latest at the end."""
+
+    entries: tuple[RefusalEntry, ...]
+
+
+@message
 class EpochChanged:
     """The shard is in this epoch and does not know the session: drop its grants, send `Hello`."""
 
@@ -439,6 +447,7 @@ Answer = (
     | Sessions
     | Broken
     | Audited
+    | Refusals
     | Staged
     | Versions
     | Forgotten

@@ -275,6 +275,20 @@ class AuditEntry(NamedTuple):
     identity: str = ""
 
 
+class RefusalEntry(NamedTuple):
+    """A right that a client lacked, how often, and when first and last by the wall clock.
+
+    `what` is on what, as rules in `cell.toml` name it.
+    """
+
+    subject: str
+    right: str
+    what: str
+    times: int
+    first_ns: int
+    last_ns: int
+
+
 class Counter(NamedTuple):
     """One named statistic of a shard."""
 

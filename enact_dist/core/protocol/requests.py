@@ -342,6 +342,11 @@ class ListAudit:
 
 
 @message
+class ListRefusals:
+    """List which rights clients lacked since the shard's start.  Answer: `Refusals`."""
+
+
+@message
 class ListHistory:
     """List the known versions of slots, oldest first, without their data.  Answer: `Versions`.
 
@@ -453,6 +458,7 @@ Request = (
     | Break
     | ForceAbort
     | ListAudit
+    | ListRefusals
     | Stage
     | ListHistory
     | Explain

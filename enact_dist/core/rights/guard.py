@@ -13,7 +13,7 @@ request                                  right
 `Survey`, `ListHistory`                  none; what is not readable is left out
 `Explain`, `FindEffects`                 `observe`; what is not readable is left out
 `ListLocks`, `ListSessions`,             `observe`
-`ListAudit`
+`ListAudit`, `ListRefusals`
 =======================================  =======================================================
 
 A question about one slot alone is refused without `read` of it: it would look like null otherwise.
@@ -39,7 +39,9 @@ from enact_dist.core.protocol.messages import (
     ListAudit,
     ListHistory,
     ListLocks,
+    ListRefusals,
     ListSessions,
+    RefusalEntry,
     Refused,
     Register,
     Stage,
@@ -60,7 +62,11 @@ TOLD_EACH_NS: Final = 1_000_000_000
 """The log names a subject and a right at most once in this time."""
 TOLD_MAX: Final = 1_000
 """Subjects and rights that are remembered for that; with one more, all of them are forgotten."""
-_OBSERVING: Final = frozenset((ListLocks, ListSessions, Explain, FindEffects, ListAudit))
+NOTED_MAX: Final = 1_000
+"""Different refusals that can be listed; one more displaces the one that is longest ago."""
+_OBSERVING: Final = frozenset(
+    (ListLocks, ListSessions, Explain, FindEffects, ListAudit, ListRefusals)
+)
 
 
 class SlotContents(Protocol):
@@ -79,13 +85,14 @@ class Guard:
         denials: Refusals of the present request that the log does not name yet.
     """
 
-    __slots__ = ("_count", "_told", "asker", "denials", "rights", "subject")
+    __slots__ = ("_count", "_noted", "_told", "asker", "denials", "rights", "subject")
 
     def __init__(self, rights: Rights, count: Callable[[str], None]) -> None:
         self.rights = rights
         self.subject = self.asker = ""
-        self.denials: list[tuple[str, str, Refused]] = []
+        self.denials: list[tuple[str, str, str, Refused]] = []
         self._count = count
+        self._noted: dict[tuple[str, str, str], RefusalEntry] = {}
         self._told: dict[tuple[str, str], tuple[int, int]] = {}
 
     def begin(self, asker: str, subject: str | None) -> None:
@@ -183,12 +190,13 @@ class Guard:
         """Refuse a right on something, and count it."""
         self._count("permission_denied")
         refused = self.rights.refuse(self.subject, self.asker, right, what)
-        self.denials.append((self.subject, right, refused))
+        self.denials.append((self.subject, right, what, refused))
         return refused
 
-    def stories(self, now_ns: int) -> Iterator[Story]:
-        """Yield what the log is to say: one line for each subject, right and second."""
-        for subject, right, refused in self.denials:
+    def stories(self, now_ns: int, wall_ns: int) -> Iterator[Story]:
+        """Note the refusals; yield what the log is to say: one line per subject, right, second."""
+        for subject, right, what, refused in self.denials:
+            self._note((subject, right, what), wall_ns)
             key = (subject, right)
             told_ns, left_out = self._told.get(key, (now_ns - TOLD_EACH_NS, 0))
             if now_ns - told_ns < TOLD_EACH_NS:
@@ -201,6 +209,17 @@ class Guard:
             asker = f" (asked by {self.asker})" if refused.code == DENIED and self.asker else ""
             yield Story("permission.denied", f"{refused.text}{asker}{more}")
         self.denials.clear()
+
+    def _note(self, key: tuple[str, str, str], wall_ns: int) -> None:
+        before = self._noted.pop(key, None)
+        if before is None and len(self._noted) >= NOTED_MAX:
+            del self._noted[next(iter(self._noted))]
+        times, first_ns = (before.times, before.first_ns) if before is not None else (0, wall_ns)
+        self._noted[key] = RefusalEntry(*key, times + 1, first_ns, wall_ns)
+
+    def noted(self) -> tuple[RefusalEntry, ...]:
+        """Return the latest refusals, each kind once, the latest at the end."""
+        return tuple(self._noted.values())
 
 
 def _asked_alone(message: object) -> Slot | None:

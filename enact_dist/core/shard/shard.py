@@ -40,11 +40,13 @@ from enact_dist.core.protocol.messages import (
     ListHistory,
     ListLocks,
     ListPlaces,
+    ListRefusals,
     ListSessions,
     Outcome,
     Ping,
     Places,
     Prepare,
+    Refusals,
     Refused,
     Register,
     Release,
@@ -148,6 +150,7 @@ class Shard:
             ListSessions: self._on_list_sessions,
             Break: self._on_break,
             ListAudit: self._on_list_audit,
+            ListRefusals: self._on_list_refusals,
             Explain: lineage.on_explain,
             FindEffects: lineage.on_find_effects,
             Fork: self._worlds.on_fork,
@@ -225,7 +228,7 @@ class Shard:
             elif guard is None or not guard.denials:
                 state.count("requests_refused")
         if guard is not None and guard.denials:
-            effects += guard.stories(now_ns)
+            effects += guard.stories(now_ns, wall_ns)
         if self._stamps.waits and not state.stored:
             effects += self._stamps.answer_reached()
         if self._views.waits or self._worlds.waits:
@@ -463,6 +466,10 @@ class Shard:
             )
         answer = inspection.audited(self.state, message)
         yield from self._sessions.answer_when_durable(reply_to, answer, records, Durability.OS)
+
+    def _on_list_refusals(self, _: ListRefusals, reply_to: int) -> Iterator[Effect]:
+        guard = self.state.guard
+        yield Reply(reply_to, Refusals(guard.noted() if guard is not None else ()))
 
     def biggest(self, count: int) -> list[tuple[str, int]]:
         """Return the slots whose newest data are the largest, with their bytes; for messages."""
