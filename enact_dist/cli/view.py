@@ -82,6 +82,7 @@ def run_view(options: argparse.Namespace) -> int:
         else:
             options.cell = cell_target(options)
             shown = stack.enter_context(open_cell(options, actor="view"))
+            shown.look()  # without the right `observe` it ends here, by its name
         viewer = stack.enter_context(Viewer(shown, _settings(options)))
         token = os.environ.get(TOKEN_VARIABLE)
         server = stack.enter_context(

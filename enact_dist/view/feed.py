@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.access.watch import Watch
 from enact_dist.core.protocol.datum import Slot
-from enact_dist.errors import EnactError
+from enact_dist.errors import EnactError, PermissionDeniedError
 from enact_dist.view.catalogue import ListedState, SlotCatalogue
 from enact_dist.view.drawing.scene import IN_SCENE, ShownDatum, shown_of
 from enact_dist.view.follower import Follower
@@ -221,7 +221,13 @@ class Feed(Follower):
         states = {slot: self.catalogue.state(slot) for slot in slots}
         asked = {slot: state.version for slot, state in states.items() if state is not None}
         if asked:
-            for slot, entry in self._source.explained(asked).items():
+            try:
+                entries = self._source.explained(asked)
+            except PermissionDeniedError as error:
+                if error.right != "read":
+                    raise
+                return  # the data themselves are refused next, each by itself
+            for slot, entry in entries.items():
                 self._sizes[slot] = entry.state.size
 
     def _fetched_ns(self, slot: Slot) -> int:
@@ -236,6 +242,10 @@ class Feed(Follower):
                 self._budget += self._sizes.get(slot, 0) - recorded.size
                 self._sizes[slot] = recorded.size
                 self._show(slot, recorded)
+            for slot, why in found.denied:
+                state = self.catalogue.state(slot)
+                if state is not None:
+                    self._unfit[slot] = state[:2], why
             self.moment_ns = at_ns
             self._news.notify_all()
 

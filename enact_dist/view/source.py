@@ -8,8 +8,15 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeVar
 
 from enact_dist.access.asking import answers_to, explained, in_parts
 from enact_dist.access.snapshot import HeldView
+from enact_dist.core.protocol.datum import Slot
 from enact_dist.core.protocol.messages import Item, ListHistory, Ping, SlotVersion, Versions
-from enact_dist.errors import ForgottenError, LeaseLostError, LinkError, ShardUnreachableError
+from enact_dist.errors import (
+    ForgottenError,
+    LeaseLostError,
+    LinkError,
+    PermissionDeniedError,
+    ShardUnreachableError,
+)
 from enact_dist.link.client.calls import CALL_S
 from enact_dist.recording.exact import Recorded
 from enact_dist.terms import Access
@@ -17,7 +24,6 @@ from enact_dist.terms import Access
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from enact_dist.core.protocol.datum import Slot
     from enact_dist.core.protocol.messages import VersionEntry
     from enact_dist.world.cell import Cell
 
@@ -40,10 +46,12 @@ class FoundData(NamedTuple):
     Attributes:
         data: By slot; a datum that was null then has none.
         forgotten: Slots whose state of that moment has left its retention.
+        denied: Slots that this program may not read, each with the text of the refusal.
     """
 
     data: dict[Slot, Recorded]
     forgotten: tuple[Slot, ...]
+    denied: tuple[tuple[Slot, str], ...] = ()
 
 
 class DataSource(Protocol):
@@ -161,6 +169,7 @@ class CellSource:
     ) -> FoundData:
         data: dict[Slot, Recorded] = {}
         forgotten: list[Slot] = []
+        denied: list[tuple[Slot, str]] = []
         left = [*in_parts(slots, TOGETHER_MAX)]
         while left:
             some = left.pop()
@@ -171,7 +180,14 @@ class CellSource:
                     forgotten += some
                 else:
                     left += in_parts(some, -(-len(some) // 2))
-        return FoundData(data, tuple(sorted(forgotten)))
+            except PermissionDeniedError as error:
+                refused = Slot(error.world, error.entity, error.aspect)
+                rest = tuple(slot for slot in some if slot != refused)
+                if len(rest) == len(some):
+                    raise
+                denied.append((refused, str(error)))
+                left += [rest] if rest else []
+        return FoundData(data, tuple(sorted(forgotten)), tuple(denied))
 
     def _viewed(
         self, slots: Sequence[Slot], at_ns: int, before: Mapping[Slot, Recorded]

@@ -174,7 +174,7 @@ class PageContents:
         known = {slot: old.recorded for slot, old in before.items()}
         found = self._source.data_at(slots, at_ns, known)
         shown: dict[Slot, ShownDatum] = {}
-        unfit = ""
+        unfit = "; ".join(why for _, why in found.denied[:1])
         for slot, recorded in found.data.items():
             version = (recorded.version, recorded.stamp_ns)
             if slot in known and (known[slot].version, known[slot].stamp_ns) == version:

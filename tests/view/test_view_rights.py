@@ -1,0 +1,76 @@
+"""The view in a cell with rights: what it may not read is named, and takes nothing else with it."""
+
+import pytest
+
+pytest.importorskip("cryptography", reason="making keys needs the extra 'keys'")
+pytest.importorskip("viser", reason="pages need the extra 'view'")
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "link"))
+
+import key_cells
+from view_samples import until
+
+from enact_dist import Aspect, Entity, Lock, Write, connect
+from enact_dist.cli.main import main
+from enact_dist.config.shows import GUESSED
+from enact_dist.core.protocol.datum import Slot
+from enact_dist.view.feed import Feed
+from enact_dist.view.source import CellSource
+
+pytestmark = pytest.mark.carrier("zenoh")
+
+RIGHTS = """
+[rights]
+default = "none"
+programs = ["reader", "blind"]
+observe = ["reader"]
+[[rights.allow]]
+who = "reader"
+read = "online:open/**"
+"""
+SLOTS = [Slot("online", name, "count") for name in ("open/x", "secret/x", "secret/y")]
+
+
+@pytest.fixture
+def file(tmp_path):
+    cell = key_cells.KeyCell(tmp_path, more=RIGHTS)
+    with cell.running():
+        yield cell.file
+
+
+def put(cell, value):
+    writes = [Write(cell.world("online"), Entity(s.entity), Aspect("count", int)) for s in SLOTS]
+    with Lock(*writes) as lock:
+        for write in writes:
+            lock[write] = value
+
+
+def test_what_is_not_readable_is_named_beside_the_rest(file, monkeypatch):
+    with connect(file, actor="ada") as ada:
+        put(ada, 1)
+        monkeypatch.setenv("ENACT_IDENTITY", "reader")
+        with connect(file, actor="view", observer=True) as cell:
+            source = CellSource(cell)
+            feed = Feed(source, lambda _: GUESSED, rate_hz=50.0, bytes_s=1e9)
+            feed.start()
+            try:
+                feed.wish("page", SLOTS)
+                until(lambda: SLOTS[0] in feed.shown(SLOTS))
+                put(ada, 2)
+                until(lambda: "reader may not read online:secret/x/count" in feed.problem)
+                until(lambda: feed.shown(SLOTS)[SLOTS[0]].recorded.version == 2)
+                assert set(feed.shown(SLOTS)) == {SLOTS[0]}
+            finally:
+                feed.stop()
+            found = source.data_at(SLOTS, feed.catalogue.newest_ns)
+            assert set(found.data) == {SLOTS[0]}
+            assert sorted(slot for slot, _ in found.denied) == SLOTS[1:]
+
+
+def test_without_the_right_to_observe_it_ends(file, capsys, monkeypatch):
+    monkeypatch.setenv("ENACT_IDENTITY", "blind")
+    assert main(["view", str(file)]) == 1
+    assert "blind may not observe the cell" in capsys.readouterr().err
