@@ -44,8 +44,9 @@ require_libraries()
 
 from enact_dist.recording.exporting import ExportSummary, export_world  # noqa: E402
 from enact_dist.recording.reading import Recording  # noqa: E402
-from enact_dist.recording.recorder import Recorder, RecordingSummary  # noqa: E402
+from enact_dist.recording.recorder import Recorder  # noqa: E402
 from enact_dist.recording.replaying import Replay, ReplaySummary  # noqa: E402
+from enact_dist.recording.summary import RecordingSummary  # noqa: E402
 
 __all__ = [
     "ExportSummary",

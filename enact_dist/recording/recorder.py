@@ -14,18 +14,32 @@ import contextlib
 import itertools
 import threading
 import time
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.access.asking import present_ns
 from enact_dist.access.watch import Watch
 from enact_dist.config.shows import GUESSED
 from enact_dist.core.protocol.datum import Slot
-from enact_dist.errors import ConfigError, LinkError, LockTimeoutError, UnknownWorldError
+from enact_dist.errors import (
+    ConfigError,
+    LinkError,
+    LockTimeoutError,
+    PermissionDeniedError,
+    UnknownWorldError,
+)
 from enact_dist.recording.disk import QUEUE_BYTES_MAX, DiskThread
 from enact_dist.recording.exact import Recorded
 from enact_dist.recording.file import CHUNK_BYTES, CHUNK_S, RecordingFile
 from enact_dist.recording.settling import END_S, Settling
+from enact_dist.recording.summary import (
+    DENIED,
+    DISK_SLOW,
+    DROPPED,
+    FORGOTTEN,
+    UNREACHABLE,
+    UNSEEN,
+    RecordingSummary,
+)
 from enact_dist.terms import Entities, NullReason
 from enact_dist.world.version_data import Retained, Wanted, between, explained, found_of
 
@@ -58,50 +72,6 @@ FINISH_S: Final = 30.0
 """How long the end of a recording may take."""
 GAP_SLOTS_MAX: Final = 1000
 """Slots that a summary names; the file names all."""
-
-FORGOTTEN: Final = "forgotten before it was fetched"
-DISK_SLOW: Final = "disk too slow"
-UNSEEN: Final = "forgotten before it was noticed"
-UNREACHABLE: Final = "its shard did not answer"
-DROPPED: Final = "its world context was dropped"
-
-
-@dataclass(slots=True)
-class RecordingSummary:
-    """What a recording holds, and what it does not.
-
-    Attributes:
-        path: The file.
-        seconds: How long it was recorded.
-        commits: Commits in it, whole; the initial data do not count as one.
-        versions: Versions in it.
-        initial: … of which were there when it began.
-        size_bytes: Bytes on the disk.
-        chunks: Whole chunks on the disk.
-        gaps: Versions that are missing, by reason.
-        gap_slots: Versions that are missing, by slot.
-        out_of_order: Commits whose notice came so late that they follow later ones.
-        counts: What else happened, by name (see `file.RecordingFile`).
-        unknown_aspects: Requested aspects that the cell does not know so far.
-    """
-
-    path: str
-    seconds: float = 0.0
-    commits: int = 0
-    versions: int = 0
-    initial: int = 0
-    size_bytes: int = 0
-    chunks: int = 0
-    gaps: dict[str, int] = field(default_factory=dict)
-    gap_slots: dict[str, int] = field(default_factory=dict)
-    out_of_order: int = 0
-    counts: dict[str, int] = field(default_factory=dict)
-    unknown_aspects: tuple[str, ...] = ()
-
-    @property
-    def missing(self) -> int:
-        """Return how many versions are missing, for whatever reason."""
-        return sum(self.gaps.values())
 
 
 class Recorder:
@@ -310,6 +280,8 @@ class Recorder:
             found = between(self._session, slot, shard, first, last) if first <= last else []
         except (LinkError, UnknownWorldError):
             found = []
+        except PermissionDeniedError:  # its versions of before may be older than the recording
+            return
         for wanted in found:
             self._want(wanted)
         if len(found) < change.gap:
@@ -377,6 +349,9 @@ class Recorder:
         except UnknownWorldError:
             self._give_up_dropped(batch)
             return
+        except PermissionDeniedError:
+            self._give_up_hidden(batch)
+            return
         del self._pending[: len(batch)]
         self._nulls.difference_update(batch)
         for wanted in batch:
@@ -402,6 +377,21 @@ class Recorder:
             self.summary.out_of_order += stamp_ns < self._last_ns
             self._last_ns = max(self._last_ns, stamp_ns)
             self._write(group, self.summary.commits, stamp_ns, entries, found)
+
+    def _give_up_hidden(self, batch: list[Wanted]) -> None:
+        """Record of data that this program may not read that they are missing."""
+        for wanted in batch:
+            try:
+                explained(self._session, [wanted])
+                found_of(self._session, [wanted])
+            except (LinkError, LockTimeoutError, UnknownWorldError):
+                continue
+            except PermissionDeniedError as error:
+                if error.right == "observe":  # of nothing it may ask what it comes from
+                    raise
+                self._pending.remove(wanted)
+                self._nulls.discard(wanted)
+                self._miss_one(wanted, DENIED)
 
     def _give_up_dropped(self, batch: list[Wanted]) -> None:
         """Record of contexts that are dropped that they end; what else waits of them is missing."""

@@ -8,6 +8,7 @@ import pytest
 pytest.importorskip("cryptography", reason="making keys needs the extra 'keys'")
 
 import sys
+import threading
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "link"))
@@ -85,3 +86,31 @@ def test_lists_leave_out_what_is_not_readable(run):
         assert status == 0
         assert f"({seen} data)" in out
     assert run("blind", ["shard", "check"])[0] == 0
+
+
+def test_a_recording_has_what_is_readable_and_names_the_rest(cell, tmp_path, monkeypatch):
+    """Notices over the network tell of data that the recorder may not read."""
+    from enact_dist.recording import Recorder
+    from enact_dist.recording.summary import DENIED
+
+    count = Aspect("count", int)
+    monkeypatch.setenv("ENACT_IDENTITY", "reader")
+    with connect(cell.file) as reader, connect(cell.file, actor="ada") as ada:
+        writes = [
+            Write(ada.world("online"), Entity(name), count) for name in ("open/x", "secret/x")
+        ]
+
+        def write():
+            for some in ([writes[0]], [writes[1]], writes):
+                with Lock(*some) as lock:
+                    for one in some:
+                        lock[one] += 1
+
+        recorder = Recorder(reader, tmp_path / "run.mcap")
+        writing = threading.Timer(0.5, write)
+        writing.start()
+        summary = recorder.run(seconds=2.0)
+        writing.join()
+    assert (summary.initial, summary.versions) == (1, 3)
+    assert summary.gaps == {DENIED: 2}
+    assert summary.gap_slots == {"online:secret/x/count": 2}

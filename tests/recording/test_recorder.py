@@ -19,6 +19,7 @@ from enact_dist.recording import Recorder, Replay, Shows, export_world, recorder
 from enact_dist.recording.exporting import world_as_of
 from enact_dist.recording.file import RecordingFile
 from enact_dist.recording.reading import Recording
+from enact_dist.recording.summary import DISK_SLOW, DROPPED
 from enact_dist.world import version_data
 
 COUNT = Aspect("count", int)
@@ -333,7 +334,7 @@ def test_too_many_that_wait_are_dropped_by_name(cell, online, tmp_path, monkeypa
         while summary.missing < 15:
             assert time.monotonic() < ends_s
             time.sleep(0.01)
-    assert summary.gaps == {recorder.DISK_SLOW: 15}
+    assert summary.gaps == {DISK_SLOW: 15}
     assert [v.version for c in commits_of(tmp_path / "run.mcap") for v in c.versions] == list(
         range(16, 21)
     )
@@ -428,7 +429,7 @@ def test_a_context_that_is_dropped_does_not_end_the_recording(cell, online, tmp_
             put((kept, 1), (lost, 1))
             cell.drop_world("what_if")
         put((kept, 2))
-    assert summary.gaps == {recorder.DROPPED: 1}
+    assert summary.gaps == {DROPPED: 1}
     assert summary.gap_slots == {"what_if:bench/count": 1}
     found = [v for commit in commits_of(tmp_path / "run.mcap") for v in commit.versions]
     assert {(v.slot.context, v.version, v.null_reason) for v in found} == {

@@ -79,7 +79,7 @@ VERBS: Final = (
     ),
     Verb(
         "reload",
-        "let running shards of this host read their key files again; sessions and locks stay",
+        "let running shards of this host take keys, names and rights anew; sessions and locks stay",
         "reload:reload_shards",
         "enact shard reload left --cell cell.toml\nenact shard reload --all",
         (
