@@ -80,15 +80,16 @@ def _coded(voxels: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64], 
 
     A layer of nothing stands all around.
     """
-    corners = voxels.min(axis=0), voxels.max(axis=0)
+    columns = np.ascontiguousarray(voxels.T)  # reducing along rows of three is 10 times slower
+    corners = columns.min(axis=1), columns.max(axis=1)
     apart = max(float(high) - float(low) for low, high in zip(*corners, strict=True)) + 3.0
     if apart > VOXELS_MAX:
         raise ValueError(f"voxels lie {apart:.0f} apart; a grid has at most {VOXELS_MAX}")
-    indices = np.asarray(voxels, np.int64)
-    lowest = indices.min(axis=0) - 1
-    extent = indices.max(axis=0) - lowest + 2
+    indices = columns.astype(np.int64)
+    lowest = indices.min(axis=1) - 1
+    extent = indices.max(axis=1) - lowest + 2
     strides = np.array([extent[1] * extent[2], extent[2], 1])
-    return (indices - lowest) @ strides, lowest, extent
+    return strides @ (indices - lowest[:, None]), lowest, extent
 
 
 class Capsule(NamedTuple):

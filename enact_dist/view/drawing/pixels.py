@@ -59,6 +59,12 @@ def with_mask(image: NDArray[np.uint8], mask: ShownImage) -> NDArray[np.uint8]:
     if covers.shape != image.shape[:2]:
         return image
     found = image.copy()
-    flat, covered = found.reshape(-1, 3), np.flatnonzero(covers)
-    flat[covered] = (flat[covered] >> 1) + HALF_MASK_COLOUR
+    rows, columns = np.flatnonzero(covers.any(axis=1)), np.flatnonzero(covers.any(axis=0))
+    if len(rows):  # a mask covers a small part: what lies around it is not touched
+        box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+        covered = covers[box].view(np.uint8)
+        for place, colour in enumerate(HALF_MASK_COLOUR):
+            channel = found[(*box, place)]
+            channel >>= covered
+            channel += covered * colour
     return found
