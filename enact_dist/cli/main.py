@@ -120,7 +120,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     try:
         return _main(list(sys.argv[1:] if argv is None else argv))
-    except KeyboardInterrupt:  # while modules of ours are loaded, too
+    except KeyboardInterrupt as error:  # while modules of ours are loaded, too
+        for line in getattr(error, "__notes__", ()):  # what it has left behind
+            print(f"enact: {line}", file=sys.stderr)
         return INTERRUPTED
 
 

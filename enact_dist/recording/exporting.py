@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.access.snapshot import HeldView
 from enact_dist.config.shows import GUESSED
 from enact_dist.core.protocol.messages import Item
+from enact_dist.errors import ConfigError
 from enact_dist.recording.exact import Recorded
 from enact_dist.recording.file import RecordingFile
 from enact_dist.terms import Access
@@ -86,6 +87,15 @@ def _portions(readings: list[Reading]) -> Iterator[list[Reading]]:
         yield portion
 
 
+class FileTooLargeError(ConfigError):
+    """A file has passed the size that it may have."""
+
+
+def _check_size(file: RecordingFile, bytes_max: int) -> None:
+    if bytes_max and file.size > bytes_max:
+        raise FileTooLargeError(f"{file.path} takes more than {bytes_max} bytes")
+
+
 def export_world(
     world: WorldContext,
     path: str | os.PathLike[str],
@@ -93,6 +103,7 @@ def export_world(
     at_ns: int = 0,
     shows: Mapping[str, Shows] | None = None,
     compression: str = "zstd",
+    bytes_max: int = 0,
 ) -> ExportSummary:
     """Write a world context as of one moment into a recording; `replay` makes it again.
 
@@ -102,10 +113,12 @@ def export_world(
         at_ns: The timestamp to export; 0: now.
         shows: How to show the data of an aspect; unnamed aspects are guessed.
         compression: "none", "lz4" or "zstd".
+        bytes_max: Size that the file must not pass; 0: any.  A larger one is deleted as soon as
+            it has passed it, so little more is ever fetched or written.
 
     Raises:
         ForgottenError: A state as of `at_ns` has left its retention.
-        ConfigError: The file exists, or cannot be made.
+        ConfigError: The file exists, cannot be made, or passes `bytes_max`.
         OSError: The disk refuses.
     """
     declared = dict(shows or {})
@@ -123,9 +136,15 @@ def export_world(
     try:
         while first is not None:
             file.add_commit((first,), log_ns)
+            _check_size(file, bytes_max)
             count += 1
             first = next(versions, None)
         file.close({"versions": str(count), "commits": "0", "missing": "0"})
+        _check_size(file, bytes_max)
+    except FileTooLargeError:
+        file.abandon()
+        file.path.unlink()
+        raise
     except BaseException:
         file.abandon()
         raise

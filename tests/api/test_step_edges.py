@@ -194,6 +194,26 @@ def test_each_context_is_dropped_by_itself(cell, step, monkeypatch):
     assert set(cell.worlds()) == {"plant", "model", "log", *names}
 
 
+def test_a_second_interrupt_names_the_contexts_that_remain(cell, step, monkeypatch):
+    """The first one ends the update, the second one the dropping."""
+
+    class Interrupted(Doubles):
+        def update(self, lock):
+            raise KeyboardInterrupt
+
+    def interrupted(self, name):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt) as found:
+        patch.setattr(Cell, "drop_world", interrupted)
+        step.run(Interrupted())
+    remaining = set(cell.worlds()) - {"plant", "model", "log"}
+    assert remaining
+    for name in remaining:
+        assert f"enact world drop {name}" in found.value.__notes__[0]
+        cell.drop_world(name)
+
+
 def test_output_in_a_context_that_the_actor_is_not_bound_to_is_named(cell):
     """It is no output that the code of today leaves out."""
     view = View(cell.world("plant"), TANK, LEVEL)

@@ -1,10 +1,13 @@
 """`enact replay --step`: the statuses, what it prints, and that it leaves the cell as it was."""
 
+import re
 import sys
 
 import pytest
 
 from enact_dist import Aspect, Entity, Lock, Retention, View, Write, connect, testing
+from enact_dist.errors import ShardUnreachableError
+from enact_dist.world.cell import Cell
 
 MODULE = """\
 from enact_dist import Actor, Aspect, Entities, Retention, View, World, Write
@@ -109,6 +112,32 @@ def test_exception_of_update_is_shown_with_its_lines(replay):
     assert 'raise RuntimeError("scale is off")' in found.out
     assert "update raised RuntimeError at " in found.out
     assert replay("--actor", "weighing:Broken", "--json").json["error"].endswith("scale is off")
+
+
+def test_interrupt_names_the_contexts_that_could_not_be_dropped(
+    replay, enact, weighed, monkeypatch
+):
+    """With the command that drops them; the status is that of an interrupt."""
+
+    def interrupt(self, lock):
+        raise KeyboardInterrupt
+
+    def away(self, name):
+        raise ShardUnreachableError("shard local does not answer", shard="local")
+
+    from weighing import Weigh
+
+    before = set(enact("world", "ls", "--cell", weighed).out.split())
+    with monkeypatch.context() as patch:
+        patch.setattr(Weigh, "update", interrupt)
+        patch.setattr(Cell, "drop_world", away)
+        found = replay("--actor", "weighing:Weigh")
+    assert found.status == 130
+    names = re.findall(r"enact world drop (step-[\w-]+)", found.err)
+    assert len(names) == 2
+    for name in names:
+        assert enact("world", "drop", name, "--cell", weighed).status == 0
+    assert set(enact("world", "ls", "--cell", weighed).out.split()) == before
 
 
 @pytest.mark.parametrize(

@@ -12,10 +12,19 @@ import pytest
 from mcap.reader import make_reader
 
 from enact_dist import Aspect, Durability, Entity, Lock, Write
+from enact_dist.access.snapshot import HeldView
 from enact_dist.core.state import history
 from enact_dist.errors import ConfigError, StoreError, UnknownWorldError
 from enact_dist.link import notices
-from enact_dist.recording import Recorder, Replay, Shows, export_world, recorder
+from enact_dist.recording import (
+    Recorder,
+    Replay,
+    Shows,
+    export_world,
+    exporting,
+    file,
+    recorder,
+)
 from enact_dist.recording.exporting import world_as_of
 from enact_dist.recording.file import RecordingFile
 from enact_dist.recording.reading import Recording
@@ -387,6 +396,23 @@ def test_export_is_a_recording_of_one_moment(cell, online, tmp_path):
     assert summary.versions == 2
     Replay(cell, path, worlds={"online": "copy"}).run()
     assert same_data(online, cell.world("copy"))
+
+
+def test_export_ends_and_leaves_no_file_once_it_is_too_large(online, tmp_path, monkeypatch):
+    """Nothing is fetched after the portion with which it passed the bound."""
+    monkeypatch.setattr(exporting, "PORTION_BYTES", 1)
+    monkeypatch.setitem(file.RecordingFile.__init__.__kwdefaults__, "chunk_bytes", 1)
+    fetched, fetch = [], HeldView.fetch
+    monkeypatch.setattr(HeldView, "fetch", lambda *given: fetched.append(1) or fetch(*given))
+    scan = Scan(np.ones((1000, 3), np.float32), "x")
+    put(*((Write(online, Entity(f"piece/{number}"), SCAN), scan) for number in range(20)))
+    whole = export_world(online, tmp_path / "whole.mcap", bytes_max=1 << 20)
+    assert whole.versions == len(fetched) == 20
+    fetched.clear()
+    with pytest.raises(exporting.FileTooLargeError, match=r"large\.mcap takes more than"):
+        export_world(online, tmp_path / "large.mcap", bytes_max=whole.size_bytes // 2)
+    assert 1 < len(fetched) < 20
+    assert not (tmp_path / "large.mcap").exists()
 
 
 def test_export_of_the_past_is_of_the_past(cell, online, tmp_path):

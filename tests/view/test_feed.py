@@ -10,12 +10,13 @@ from enact_dist import Entity, Lock, Write
 from enact_dist.access.snapshot import HeldView
 from enact_dist.config.shows import GUESSED
 from enact_dist.core.protocol.datum import Slot
-from enact_dist.errors import MisuseError, UnknownWorldError
+from enact_dist.errors import ConfigError, MisuseError, UnknownWorldError
 from enact_dist.recording import Recorder
 from enact_dist.recording.reading import Recording
 from enact_dist.view import feed as feeds
 from enact_dist.view.activity import Activity
 from enact_dist.view.feed import Feed
+from enact_dist.view.pages import datum
 from enact_dist.view.pages.comparing import MARKED, NOW, Side
 from enact_dist.view.pages.contents import PageContents
 from enact_dist.view.pages.datum import Lineage, Samples, recording_of
@@ -364,6 +365,13 @@ def test_a_moment_is_a_recording_that_can_be_shown(cell, tmp_path):
     source = RecordingSource(tmp_path / name)
     data = source.data_at([SLOT], source.timeline.newest_ns).data
     assert decode_untyped(data[SLOT].datum)[0, 3] == 1.0
+
+
+def test_a_moment_too_large_for_a_browser_is_refused_and_leaves_no_file(cell, monkeypatch):
+    """The refusal names the command that writes it."""
+    monkeypatch.setattr(datum, "FILE_BYTES_MAX", 100)
+    with pytest.raises(ConfigError, match=r"more than 100 bytes.*enact world export online"):
+        recording_of(CellSource(cell), "online", move(cell, 1.0).stamp_ns, SHOWS)
 
 
 def test_a_recording_is_a_past(cell, tmp_path):

@@ -226,15 +226,22 @@ class Step:
 
         Raises:
             EnactError: Some are still there; names them, and how to drop them.
+            KeyboardInterrupt: The user does not wait for it; a note names those that may be there.
         """
         left: dict[str, EnactError] = {}
-        for name in names:
+        for number, name in enumerate(names):
             try:
                 self._cell.drop_world(name)
             except UnknownWorldError:
                 pass
             except EnactError as error:
                 left[name] = error
+            except KeyboardInterrupt as error:
+                todo = ", ".join(f"enact world drop {one}" for one in (*left, *names[number:]))
+                error.add_note(
+                    f"this step's world contexts may have to be dropped by hand ({todo})"
+                )
+                raise
         if left:
             todo = ", ".join(f"enact world drop {name}" for name in left)
             why = next(iter(left.values()))

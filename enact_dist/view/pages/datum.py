@@ -152,14 +152,16 @@ def recording_of(
         ForgottenError: The moment has left the retention of some data.
         ShardUnreachableError: A shard does not answer.
     """
-    from enact_dist import recording
+    from enact_dist.recording.exporting import FileTooLargeError, export_world
 
     with tempfile.TemporaryDirectory(prefix="enact-view-") as folder:
         path = Path(folder) / "export.mcap"
-        done = recording.export_world(source.cell.world(world), path, at_ns=at_ns, shows=shows)
-        if done.size_bytes > FILE_BYTES_MAX:
+        context = source.cell.world(world)
+        try:
+            export_world(context, path, at_ns=at_ns, shows=shows, bytes_max=FILE_BYTES_MAX)
+        except FileTooLargeError as error:
             raise ConfigError(
-                f"{world} takes {done.size_bytes} bytes, too many for a browser: use"
+                f"{world} takes more than {FILE_BYTES_MAX} bytes, too many for a browser: use"
                 f" enact world export {world} --out FILE.mcap"
-            )
+            ) from error
         return f"{world}_{at_ns}.mcap", path.read_bytes()
