@@ -1,4 +1,4 @@
-"""A folder that users of one group share: who may write a payload, and who may not find it."""
+"""A folder that users of one group share: they reach the socket, and no file."""
 
 import os
 import shutil
@@ -12,14 +12,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from ports import free_endpoint
-from test_payload_desk import FILE, SIZE, adopted, names, stage
+from test_payload_desk import FILE, SIZE, adopted, stage
 
 from enact_dist import Aspect, Durability, Entity, Lock, View, Write, connect
 from enact_dist.config.read import load_config
+from enact_dist.errors import LinkError
 from enact_dist.link.daemon.daemon import start_shard
 from enact_dist.link.daemon.settings import DaemonSettings
 from enact_dist.link.memory.payload_desk import PayloadDesk
-from enact_dist.link.memory.shared_folder import SharedFolder
+from enact_dist.link.memory.shared_folder import SharedFolder, open_shared
 
 STRANGER = 65534
 
@@ -38,69 +39,121 @@ def mode_of(path):
     return stat.S_IMODE(path.stat().st_mode)
 
 
-def found(act):
-    try:
-        return type(act()).__name__
-    except OSError as error:
-        return type(error).__name__
+ATTACKS = """
+import os, sys
+folder, file = sys.argv[1:3]
+aims = (f"{folder}/files/{file}", f"{folder}/{file}", f"{folder}/uses-{file}")
+ways = {
+    "list": lambda p: os.listdir(os.path.dirname(p)),
+    "read": lambda p: os.open(p, os.O_RDONLY),
+    "write": lambda p: os.open(p, os.O_RDWR),
+    "truncate": lambda p: os.truncate(p, 0),
+    "chmod": lambda p: os.chmod(p, 0o666),
+    "rename": lambda p: os.rename(p, p + "x"),
+    "unlink": lambda p: os.unlink(p),
+    "symlink": lambda p: os.symlink("/etc/passwd", p + "y"),
+    "link": lambda p: os.link(p, os.path.dirname(folder) + "/mine"),
+}
+for name, way in ways.items():
+    for path in aims:
+        try:
+            way(path)
+            print(name, path)
+        except (PermissionError, FileNotFoundError):
+            pass
+try:
+    os.rename(folder, folder + "x")
+    print("rename of the folder")
+except PermissionError:
+    pass
+"""
+CLIENT = """
+import sys
+import numpy as np
+from enact_dist import Aspect, Durability, Entity, Lock, View, Write, connect
+cell = connect(sys.argv[1], actor="other")
+cloud = Aspect("cloud", np.ndarray, Durability.VOLATILE)
+if sys.argv[2] == "write":
+    with Lock(request := Write(cell.world("online"), Entity("other"), cloud)) as lock:
+        lock[request] = np.arange(300_000)
+else:
+    request = View(world := cell.world("online"), Entity("arm"), cloud)
+    print(int(world.view(request)[request].sum()))
+print(cell._client.carrier.transport_of("s0"))
+"""
+as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root may run processes of other users")
 
 
-def tried(folder, *files):
-    """Return what another user of the group gets of a folder and of files by their names."""
-    if os.geteuid() == 0:
-        os.seteuid(STRANGER)
-    try:
-        told = [found(lambda: list(folder.path.iterdir()))]
-        for file in files:
-            for access in (os.O_RDWR, os.O_RDONLY):
-                told.append(found(lambda: os.close(os.open(folder.path / file, access))))  # noqa: B023
-    finally:
-        if os.geteuid() == STRANGER:
-            os.seteuid(0)
-    return told
+BECOMES = """
+import importlib, os, pkgutil, sys
+import numpy, zenoh, enact_dist.link, enact_dist.access, enact_dist.config, enact_dist.world
+for part in (enact_dist.link, enact_dist.access, enact_dist.config, enact_dist.world):
+    for found in pkgutil.walk_packages(part.__path__, part.__name__ + "."):
+        importlib.import_module(found.name)  # the other user may not read them
+os.setgroups([])
+os.setgid(int(sys.argv[-1]))
+os.setuid(int(sys.argv[-2]))
+"""
 
 
-def test_draft_has_a_name_that_its_client_alone_is_told(folder):
-    """Who maps it before the commit could change what all read after it."""
+def run_as(user, group, text, *words):
+    """Return what a program of another user prints."""
+    line = [sys.executable, "-c", BECOMES + text, *map(str, (*words, user, group))]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=60, check=False)
+    assert not done.returncode, done.stderr
+    return done.stdout.split("\n")[:-1]
+
+
+def test_only_the_owner_enters_the_folder_of_files(folder):
+    """The group reaches the nonce and the socket; payloads and pages are 0600 in 0700."""
     desk = PayloadDesk(folder, 10 * SIZE)
-    told, other = stage(desk), stage(desk, "d4-1")
-
-    assert len({told.draft, other.draft, FILE}) == 3
-    assert names(folder) == sorted((told.draft, other.draft))
-    assert mode_of(folder.path / told.draft) == 0o660
-    assert mode_of(folder.path) == 0o2710
-    (folder.path / told.draft).write_bytes(b"x" * SIZE)
-
+    stage(desk)
+    draft = mode_of(folder.path / "files" / FILE)
     datum = adopted(desk)
 
-    assert (datum.file, bytes(datum.body)) == (FILE, b"x" * SIZE)
-    assert names(folder) == sorted((FILE, other.draft))
-    assert mode_of(folder.path / FILE) == 0o440
-    stage(desk, "d4-1", total=0)
-    del datum
-    assert names(folder) == []
-
-
-def test_another_user_of_the_group_finds_no_draft_and_writes_no_payload(folder):
-    """He may know sessions and their numbers: these stand in listings."""
-    desk = PayloadDesk(folder, 10 * SIZE)
-    told = stage(desk)
-    (folder.path / told.draft).write_bytes(b"x" * SIZE)
-    before = tried(folder, FILE)
-    datum = adopted(desk)
-    after = tried(folder, FILE, told.draft)
-
-    if os.geteuid() == 0:  # else the other user is this one
-        assert before == ["PermissionError", "FileNotFoundError", "FileNotFoundError"]
-        assert after[:3] == ["PermissionError", "PermissionError", "NoneType"]
-    assert before[-2:] == ["FileNotFoundError", "FileNotFoundError"]
-    assert after[-2:] == ["FileNotFoundError", "FileNotFoundError"]
+    assert (draft, mode_of(folder.path / "files" / FILE)) == (0o600, 0o400)
+    assert (mode_of(folder.path), mode_of(folder.path / "files") & 0o777) == (0o2710, 0o700)
+    assert mode_of(folder.path / "nonce") == 0o440
     assert datum.size == SIZE
+    opened = open_shared(folder.name, folder.nonce)
+    assert opened.files not in (-1, opened.descriptor)
+    opened.close()
+    del datum
+    assert not list((folder.path / "files").iterdir())
+
+
+def test_root_of_a_group_gets_the_sticky_bit(folder, shared_root):
+    """Otherwise one user of the group could put his own folder in place of a shard's."""
+    assert mode_of(shared_root) & stat.S_ISVTX
+
+    shared_root.chmod(0o2770)
+
+    with pytest.raises(LinkError, match="sticky"):
+        open_shared(folder.name, folder.nonce)
+
+
+@as_root
+def test_user_of_the_group_neither_reads_nor_changes_a_payload(folder, shared_root):
+    """Whatever names he knows: list, read, write, truncate, chmod, rename, links."""
+    os.chown(shared_root, 0, STRANGER)
+    shared_root.chmod(0o3770)
+    os.chown(folder.path, 0, STRANGER)
+    desk = PayloadDesk(folder, 10 * SIZE)
+    stage(desk)
+
+    before = run_as(STRANGER - 1, STRANGER, ATTACKS, folder.path, FILE)
+    datum = adopted(desk)
+    after = run_as(STRANGER - 1, STRANGER, ATTACKS, folder.path, FILE)
+
+    assert (before, after) == ([], [])
+    assert bytes(datum.body) == bytes(SIZE)
 
 
 @pytest.mark.carrier("socket", "zenoh")
-def test_large_data_go_through_a_folder_of_a_group_without_a_copy(folder, daemon, endpoint):
-    """What may not be listed is written and mapped by its name all the same."""
+def test_large_data_of_the_shards_user_go_through_a_folder_of_a_group_without_a_copy(
+    folder, daemon, endpoint
+):
+    """What others may not enter, the shard's own user maps by name all the same."""
     shard = daemon(endpoint)
     with connect(endpoint) as writer, connect(endpoint) as reader:
         cloud = Aspect("cloud", np.ndarray, Durability.VOLATILE)
@@ -137,8 +190,8 @@ with connect(sys.argv[1], actor="writer") as cell:
     try:
         world.view(view)
     except PermissionDeniedError as error:
-        print(error.right, cell.statistics()["maps_failed"])
-    folder = os.path.join(os.environ["ENACT_SHARED_FOLDER"], sys.argv[2])
+        print(error.right, cell.statistics().get("maps_failed", 0))
+    folder = os.path.join(os.environ["ENACT_SHARED_FOLDER"], sys.argv[2], "files")
     for file in sys.argv[3:]:
         for access in (os.O_RDWR, os.O_RDONLY):
             try:
@@ -178,16 +231,40 @@ def test_users_of_a_cell_with_rights_get_copies(tmp_path, monkeypatch):
                 for write in writes:
                     lock[write] = np.full(100_000, 1)
             assert "payload_fallbacks" not in ada.statistics()
-            payloads = [one.name for one in shard._shared.path.glob("*-*")]
+            payloads = [one.name for one in (shard._shared.path / "files").glob("*-*")]
             files = [one for one in payloads if not one.startswith("uses-")]
             words = [sys.executable, "-c", OTHER_USER, endpoint, shard._shared.name, *files]
             told = subprocess.run(words, capture_output=True, text=True, check=False)
             assert told.returncode == 0, told.stderr
-            assert told.stdout.split() == ["read", "1", *["PermissionError"] * 2 * len(files)]
+            assert told.stdout.split() == ["read", "0", *["PermissionError"] * 2 * len(files)]
             assert len(files) == 2
             view = View(online := ada.world("online"), Entity("open/arm"), cloud)
             assert online.view(view)[view].sum() == 300_000
-        assert {mode_of(shard._shared.path / one) for one in files} == {0o400}
+        assert {mode_of(shard._shared.path / "files" / one) for one in files} == {0o400}
     finally:
         shard.stop(drain_s=0.0)
         shutil.rmtree(root)
+
+
+@as_root
+@pytest.mark.carrier("socket")
+def test_large_data_of_other_users_travel_over_the_socket(folder, daemon, endpoint, shared_root):
+    """They get copies, and no file: a reader and a writer of two further users."""
+    os.chown(shared_root, 0, STRANGER)
+    shared_root.chmod(0o3770)
+    for above in (shared_root, *shared_root.parents):
+        if above.stat().st_uid == 0 and not above.stat().st_mode & 0o001 and above != shared_root:
+            pytest.skip(f"other users may not enter {above}")
+    shard = daemon(endpoint)
+    cloud = Aspect("cloud", np.ndarray, Durability.VOLATILE)
+    with connect(endpoint) as cell:
+        with Lock(request := Write(cell.world("online"), Entity("arm"), cloud)) as lock:
+            lock[request] = np.arange(SIZE)
+        told = run_as(STRANGER - 1, STRANGER, CLIENT, endpoint, "read")
+        wrote = run_as(STRANGER - 2, STRANGER, CLIENT, endpoint, "write")
+        request = View(online := cell.world("online"), Entity("other"), cloud)
+        assert online.view(request)[request].sum() == sum(range(300_000))
+
+    assert told == [str(sum(range(SIZE))), "socket"]
+    assert wrote == ["socket"]
+    assert shard.host._payloads.figures()["payloads_adopted"] == 2

@@ -296,8 +296,7 @@ def _shared_folder(settings: DaemonSettings) -> SharedFolder | None:
     if settings.carrier == "zenoh" and settings.shared_bytes_max == 0:
         return None
     try:
-        private = settings.shard.rights is not None
-        return SharedFolder(settings.cell, settings.shard.name, private=private)
+        return SharedFolder(settings.cell, settings.shard.name)
     except LinkError as error:
         if settings.carrier == "socket":
             raise

@@ -118,19 +118,15 @@ def _cut_off(pages: Pages, descriptor: int) -> None:
 
 
 class _Shared:
-    """The shared folder of one start of a shard, if this process sees it.
+    """The shared folder of one start of a shard, if this process sees it."""
 
-    Attributes:
-        closed: Whether its files are for the shard's own user alone, and this is another.
-    """
-
-    __slots__ = ("closed", "epoch", "folder", "keeps", "name", "nonce", "page")
+    __slots__ = ("epoch", "folder", "keeps", "name", "nonce", "page")
 
     def __init__(self, welcome: Welcome) -> None:
         self.name, self.nonce, self.epoch = welcome.shared, welcome.shared_nonce, welcome.epoch
         self.folder: OpenedFolder | None = None
         self.page: ClientPage | None = None
-        self.keeps = self.closed = False
+        self.keeps = False
 
     def __del__(self) -> None:
         if self.folder is not None:
@@ -174,14 +170,15 @@ class SharedPayloads:
             if shared.name:
                 try:
                     shared.folder = open_shared(shared.name, shared.nonce)
-                    shared.keeps = retains()
+                    shared.keeps = shared.folder.files >= 0 and retains()
                 except EnactError as error:
                     self._count("payload_folders_elsewhere")
                     _log.info("shard %s: %s", welcome.shard, error)
 
     def _folder(self, shard: str) -> _Shared | None:
+        """Return what a shard shares if this process may open its files."""
         shared = self._shards.get(shard)
-        if shared is None or shared.folder is None or shared.closed:
+        if shared is None or shared.folder is None or shared.folder.files < 0:
             return None
         return shared
 
@@ -213,8 +210,8 @@ class SharedPayloads:
             if shared is None or folder is None:
                 return
             try:
-                if shared.page is None or not shared.page.is_in(folder.descriptor, self._session):
-                    shared.page = ClientPage(folder.descriptor, folder.owner, self._session)
+                if shared.page is None or not shared.page.is_in(folder.files, self._session):
+                    shared.page = ClientPage(folder.files, folder.owner, self._session)
             except OSError as error:
                 self.keep_no_more(shard, error)
 
@@ -260,9 +257,7 @@ class SharedPayloads:
             name = answer.draft or file
             return Draft(shard, file, size, self._opened(shared, name, size, os.O_RDWR))
         except OSError as error:
-            # Most likely the folder is read-only here, or that of another user in a cell with
-            # rights.
-            shared.closed = isinstance(error, PermissionError)
+            # Most likely the folder is read-only here.
             self._count("payload_fallbacks")
             _log.info("payload %s of shard %s: %s", file, shard, error)
             self.drop(shard, file)
@@ -341,7 +336,6 @@ class SharedPayloads:
                 finally:
                     os.close(descriptor)
             except OSError as error:
-                shared.closed = isinstance(error, PermissionError)
                 self._count("maps_failed")
                 _log.info("payload %s of shard %s cannot be mapped: %s", file, shard, error)
                 return None
@@ -357,7 +351,7 @@ class SharedPayloads:
         """
         assert shared.folder is not None
         flags = access | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-        descriptor = os.open(file, flags, dir_fd=shared.folder.descriptor)
+        descriptor = os.open(file, flags, dir_fd=shared.folder.files)
         found = os.fstat(descriptor)
         # If it were shorter than announced, touching the missing part would kill the process.
         fits = stat.S_ISREG(found.st_mode) and found.st_size == size

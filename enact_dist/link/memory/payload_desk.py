@@ -206,8 +206,7 @@ class PayloadDesk:
             return self._staged(file, draft)
 
     def _staged(self, file: str, draft: _Draft) -> Staged:
-        name = "" if self._disk is None else self._disk.drafts.get(file, "")
-        return Staged(file, draft.have, draft.shared, name)
+        return Staged(file, draft.have, draft.shared)
 
     def _opened(self, session: str, owner: str, file: str, total: int) -> _Draft | Refused | None:
         """Return a new draft; None if its name has been used meanwhile."""

@@ -5,6 +5,7 @@
     /dev/shm/enact-1000/             the root: ENACT_SHARED_FOLDER, or this one of the user
         cell.shard.5f0c…/            one start of a shard: its socket, and what else it shares
             nonce                    128 random bits, sent in the shard's WELCOME
+            files/                   only in the root of a group: what its own user alone may enter
 
 Host names and boot ids cannot tell whether two processes share memory, since containers have them
 in common.  So a client opens *its own* path of that name and compares the nonce.
@@ -15,10 +16,9 @@ Rules that a change must keep:
   lifetime; a process that gets the lock may delete the folder.
 - The shard writes the nonce after taking the lock and before sending the folder's name.
 - Only the owner, root, and the group of a deliberately configured root may enter.
-- The group may not list the folder, so that only a draft's client knows the draft's name.
-- In a cell with rights the group may use the socket alone: a file has no rights per datum, and who
-  has mapped a draft for writing can change it after its commit.  So the data of other users travel
-  as messages.
+- The group reaches the socket and the nonce, and nothing else: a file that other users may write
+  could be changed after its commit, and one that they may read needs no right.
+- Only its owner and root may replace a folder in the root, so a root of a group has the sticky bit.
 """
 
 from __future__ import annotations
@@ -44,6 +44,8 @@ SHARED_FOLDER_VARIABLE: Final = "ENACT_SHARED_FOLDER"
 MEMORY: Final = Path("/dev/shm")  # noqa: S108 - the kernel's folder, not a temporary file
 NONCE: Final = "nonce"
 NONCE_BYTES: Final = 16
+FILES: Final = "files"
+"""The folder of payloads and pages in the root of a group; elsewhere they are beside the nonce."""
 PAGES: Final = "uses-"
 """So begin the names of the pages on which clients see which of their grants live (`use_marks`)."""
 NAME_BYTES_MAX: Final = 200
@@ -65,26 +67,22 @@ def shared_root() -> Path:
 
 
 class FolderAccess(NamedTuple):
-    """Permissions of everything made below a root.
+    """Permissions of what a group may reach below a root; all else is 0700 and 0600.
 
     Attributes:
         group: The group that may enter, besides owner and root; None: no group.
         folder_mode: Mode of a folder: its files inherit the group, which may not list them.
         socket_mode: Mode of a socket: connecting needs write permission.
-        draft_mode: Mode of a file that clients fill.
-        file_mode: Mode of a file that clients read.
         nonce_mode: Mode of the nonce.
     """
 
     group: int | None
     folder_mode: int = 0o2710
     socket_mode: int = 0o660
-    draft_mode: int = 0o660
-    file_mode: int = 0o440
     nonce_mode: int = 0o440
 
 
-_PRIVATE: Final = FolderAccess(None, 0o700, 0o600, 0o600, 0o400, 0o400)
+_PRIVATE: Final = FolderAccess(None, 0o700, 0o600, 0o400)
 
 
 def _open_root(root: Path, *, make: bool) -> tuple[int, FolderAccess]:
@@ -105,8 +103,15 @@ def _open_root(root: Path, *, make: bool) -> tuple[int, FolderAccess]:
     found = os.fstat(opened)
     mode = found.st_mode
     problem = ""
+    shared_by_group = chosen and mode & stat.S_IWGRP and not mode & stat.S_IWOTH
+    if make and shared_by_group and not mode & stat.S_ISVTX and found.st_uid == os.geteuid():
+        with contextlib.suppress(OSError):  # refused below
+            os.fchmod(opened, stat.S_IMODE(mode) | stat.S_ISVTX)
+            mode = os.fstat(opened).st_mode
     if mode & stat.S_IWOTH and not mode & stat.S_ISVTX:
         problem = "every user may replace its contents (its mode lacks the sticky bit)"
+    elif shared_by_group and not mode & stat.S_ISVTX:
+        problem = "its group may replace its contents (its mode lacks the sticky bit)"
     elif not chosen and found.st_uid != os.geteuid():
         problem = f"it belongs to user {found.st_uid}"
     if problem:
@@ -115,8 +120,7 @@ def _open_root(root: Path, *, make: bool) -> tuple[int, FolderAccess]:
             f"the shared folder {root} is refused: {problem}; correct it, or name another in"
             f" {SHARED_FOLDER_VARIABLE}"
         )
-    for_group = chosen and mode & stat.S_IWGRP and not mode & stat.S_IWOTH
-    return opened, FolderAccess(found.st_gid) if for_group else _PRIVATE
+    return opened, FolderAccess(found.st_gid) if shared_by_group else _PRIVATE
 
 
 class SharedFolder:
@@ -129,26 +133,22 @@ class SharedFolder:
         cell: Name of the cell.
         shard: Name of the shard.
         root: Where; None: as the environment says.
-        private: Whether only the shard's own user may use its files, in a group's folder too.
 
     Attributes:
         name: Its name below the root, for the WELCOME.
         nonce: Content of its nonce file.
         path: Its path in this process.
         descriptor: Of the folder, open until `close`.
+        files: Of the folder of payloads and pages, perhaps the same; open until `close`.
         access: Its permissions.
 
     Raises:
         LinkError: No folder can be made, or the root is not safe.
     """
 
-    def __init__(
-        self, cell: str, shard: str, *, root: Path | None = None, private: bool = False
-    ) -> None:
+    def __init__(self, cell: str, shard: str, *, root: Path | None = None) -> None:
         root = root or shared_root()
         opened, access = _open_root(root, make=True)
-        if private:
-            access = access._replace(draft_mode=0o600, file_mode=0o400)
         try:
             _sweep(opened, root)
             parts = (cell[:PART_CHARACTERS_MAX], shard[:PART_CHARACTERS_MAX])
@@ -160,8 +160,12 @@ class SharedFolder:
             raise LinkError(f"nothing can be made in {root}: {error.strerror}") from None
         finally:
             os.close(opened)
+        self.files = self.descriptor
         try:
             self._write_nonce()
+            if self.access.group is not None:
+                os.mkdir(FILES, 0o700, dir_fd=self.descriptor)
+                self.files = _open_folder(FILES, self.descriptor)
         except OSError as error:
             self.close()
             raise LinkError(f"nothing can be written to {self.path}: {error.strerror}") from None
@@ -185,14 +189,21 @@ class SharedFolder:
             shutil.rmtree(self.path, ignore_errors=True)
             # Another thread may get this descriptor's number, so no file may be named by it any
             # more.
-            descriptor, self.descriptor = self.descriptor, -1
-            os.close(descriptor)
+            opened = {self.descriptor, self.files}
+            self.descriptor = self.files = -1
+            for descriptor in opened:
+                os.close(descriptor)
+
+
+def _open_folder(name: str, above: int) -> int:
+    flags = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+    return os.open(name, flags, dir_fd=above)
 
 
 def _make(root: int, name: str, access: FolderAccess) -> tuple[FolderAccess, int]:
     """Make a folder and lock it; set its permissions last."""
     os.mkdir(name, 0o700, dir_fd=root)
-    made = os.open(name, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=root)
+    made = _open_folder(name, root)
     try:
         # A sweeper that holds it right now releases it at once: it finds no nonce.
         fcntl.flock(made, fcntl.LOCK_EX)
@@ -215,14 +226,12 @@ def _sweep(root: int, path: Path) -> None:
             found = os.stat(entry, dir_fd=root, follow_symlinks=False)
             if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid():
                 continue
-            flags = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
-            opened = os.open(entry, flags, dir_fd=root)
+            opened = _open_folder(entry, root)
         except OSError:  # gone meanwhile
             continue
         try:
             if _is_left_behind(opened, found):
-                with contextlib.suppress(OSError):
-                    _clear_pages(opened)
+                _clear_pages(opened)
                 shutil.rmtree(path / entry, ignore_errors=True)
         finally:
             os.close(opened)
@@ -234,14 +243,21 @@ def _clear_pages(folder: int) -> None:
     Its clients may not have heard of that, and what they have mapped stays.  Data that were lost
     with it must not be read under its grants once the next start shows that they are lost.
     """
-    for name in os.listdir(folder):
-        if name.startswith(PAGES):
-            flags = os.O_WRONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-            page = os.open(name, flags, dir_fd=folder)
-            try:
-                os.pwrite(page, bytes(os.fstat(page).st_size), 0)
-            finally:
-                os.close(page)
+    with contextlib.suppress(OSError):
+        for name in os.listdir(folder):
+            if name.startswith(PAGES):
+                flags = os.O_WRONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+                page = os.open(name, flags, dir_fd=folder)
+                try:
+                    os.pwrite(page, bytes(os.fstat(page).st_size), 0)
+                finally:
+                    os.close(page)
+    with contextlib.suppress(OSError):  # usually there is none
+        files = _open_folder(FILES, folder)
+        try:
+            _clear_pages(files)
+        finally:
+            os.close(files)
 
 
 def _is_left_behind(folder: int, found: os.stat_result) -> bool:
@@ -266,11 +282,13 @@ class OpenedFolder:
 
     Attributes:
         descriptor: Of the folder.
+        files: Of the folder of payloads and pages, perhaps the same; -1: this user may not enter.
         path: Its path in this process.
         owner: The user that runs the shard.
     """
 
     descriptor: int
+    files: int
     path: Path
     owner: int
 
@@ -279,8 +297,9 @@ class OpenedFolder:
         return address_in(self.descriptor, self.path, name)
 
     def close(self) -> None:
-        """Close the descriptor; files opened and sockets connected through it stay open."""
-        os.close(self.descriptor)
+        """Close the descriptors; files opened and sockets connected through them stay open."""
+        for descriptor in {self.descriptor, self.files} - {-1}:
+            os.close(descriptor)
 
 
 def open_shared(name: str, nonce: bytes, *, root: Path | None = None) -> OpenedFolder:
@@ -322,7 +341,13 @@ def open_shared(name: str, nonce: bytes, *, root: Path | None = None) -> OpenedF
     except BaseException:
         os.close(opened)
         raise
-    return OpenedFolder(opened, path, found.st_uid)
+    files = opened
+    if found.st_mode & stat.S_IRWXG:
+        try:
+            files = _open_folder(FILES, opened)
+        except OSError:
+            files = -1  # of another user: large data come through the socket
+    return OpenedFolder(opened, files, path, found.st_uid)
 
 
 def _is_plain(name: str) -> bool:

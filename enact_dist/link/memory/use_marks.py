@@ -135,13 +135,13 @@ class ShardMarks:
     def _made(self, session: str) -> ShardPage | None:
         """Make a session's page; None if there is no room for it, or no such locks."""
         folder, name = self._folder, page_name(session)
-        if folder.descriptor < 0:
+        if folder.files < 0:
             return None
         flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
         try:
-            descriptor = os.open(name, flags, 0o600, dir_fd=folder.descriptor)
+            descriptor = os.open(name, flags, 0o600, dir_fd=folder.files)
             try:
-                os.fchmod(descriptor, folder.access.draft_mode)
+                os.fchmod(descriptor, 0o600)
                 os.posix_fallocate(descriptor, 0, PAGE_BYTES)
                 page = ShardPage(descriptor)
                 page.locked(PROOF)
@@ -181,9 +181,9 @@ class ShardMarks:
             self._unlink(session)
 
     def _unlink(self, session: str) -> None:
-        if self._folder.descriptor >= 0:
+        if self._folder.files >= 0:
             with contextlib.suppress(FileNotFoundError):
-                os.unlink(page_name(session), dir_fd=self._folder.descriptor)
+                os.unlink(page_name(session), dir_fd=self._folder.files)
 
 
 def mark_uses(kept: KeptGrants, folder: SharedFolder | None) -> None:

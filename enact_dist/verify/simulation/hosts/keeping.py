@@ -158,7 +158,7 @@ class SimulatedMarks(ShardMarks):
 class _NoFolder:
     """What stands for a shard's shared folder: its pages are in plain memory."""
 
-    descriptor = -1
+    descriptor = files = -1
 
 
 class _Shared:
