@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+import enact_dist.config
 import enact_dist.core
 import enact_dist.link
 import enact_dist.wire
@@ -111,8 +112,8 @@ def become(user, group, *groups):
     """Go on as another user, who may not be able to read the interpreter's own files."""
     import zenoh  # noqa: F401
 
-    for package in (enact_dist, enact_dist.core, enact_dist.wire, enact_dist.link):
-        for module in pkgutil.iter_modules(package.__path__, f"{package.__name__}."):
+    for package in (enact_dist.core, enact_dist.wire, enact_dist.config, enact_dist.link):
+        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
             importlib.import_module(module.name)
     os.setgroups([int(one) for one in groups])
     os.setresgid(int(group), int(group), int(group))

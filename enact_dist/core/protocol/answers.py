@@ -161,8 +161,8 @@ class Committed:
 class Staged:
     """How much of a payload has arrived in slices, from its start and without a gap.
 
-    `shared` says that it is a file in the shard's folder, to be filled there, too.  Until its
-    commit it is called `draft` there ("": `file`), a name that only this client learns.
+    `shared` says that it is a file in the shard's folder, to be filled there, too.  Shards of
+    earlier releases called it `draft` there until its commit; "" stands for `file`.
     """
 
     file: str

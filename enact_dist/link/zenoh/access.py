@@ -25,7 +25,6 @@ from __future__ import annotations
 import hashlib
 import json
 import secrets
-import tomllib
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
@@ -196,6 +195,8 @@ def read_revoked(folder: Path) -> dict[str, int]:
     Raises:
         ConfigError: The file cannot be read or used.
     """
+    import tomllib  # no client needs it
+
     file = folder / REVOKED_FILE
     try:
         found = tomllib.loads(file.read_text("utf-8"))
