@@ -23,7 +23,6 @@ stand in `rights.toml` beside the file, since a shard does not import the module
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -231,6 +230,8 @@ def read_declared(file: Path) -> tuple[AllowTable, ...]:
     Raises:
         ConfigError: It is missing or no such file.
     """
+    import tomllib  # no client needs it
+
     try:
         tables = tomllib.loads(file.read_text("utf-8")).get("allow", [])
         return tuple(

@@ -171,11 +171,11 @@ def test_large_data_of_the_shards_user_go_through_a_folder_of_a_group_without_a_
 OTHER_USER = """
 import importlib, os, pkgutil, sys
 import numpy as np
-import enact_dist.core, enact_dist.link, enact_dist.wire
+import enact_dist.config, enact_dist.core, enact_dist.link, enact_dist.wire
 from enact_dist import Aspect, Durability, Entity, Lock, View, Write, connect
 from enact_dist.errors import PermissionDeniedError
 
-for package in (enact_dist.core, enact_dist.link, enact_dist.wire):
+for package in (enact_dist.config, enact_dist.core, enact_dist.link, enact_dist.wire):
     for found in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
         importlib.import_module(found.name)
 os.setgroups([4242]), os.setgid(4243), os.setuid(4243)
