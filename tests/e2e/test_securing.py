@@ -10,7 +10,6 @@ import pytest
 
 pytest.importorskip("cryptography", reason="making keys needs the extra 'keys'")
 
-from conftest import Process
 from ports import free_port
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
@@ -41,15 +40,15 @@ write = "online:*/both/count"
 class Host:
     """A host: its own copy of cell.toml and of its keys, and its shard."""
 
-    def __init__(self, folder, shard):
-        self.folder, self.shard = folder / shard, shard
+    def __init__(self, folder, shard, make_process):
+        self.folder, self.shard, self._make_process = folder / shard, shard, make_process
         self.folder.mkdir()
         self.file = self.folder / "cell.toml"
         self.process = None
 
     def start(self):
         words = ("-m", "enact_dist.cli.main", "shard", "run", self.shard, "--cell", self.file)
-        self.process = Process(words, self.folder / "shard.log")
+        self.process = self._make_process(*words)
         self.process.expect("ready:")
 
     def restart(self):
@@ -152,10 +151,10 @@ def make_keys(office, text, hosts, monkeypatch):
             shutil.copy2(office / "keys" / file, host.folder / "keys" / file)
 
 
-def test_a_running_cell_gets_keys_and_rights_host_after_host(tmp_path, monkeypatch):
+def test_a_running_cell_gets_keys_and_rights_host_after_host(tmp_path, monkeypatch, make_process):
     """No acknowledged update is lost; each host's interruption is its restart and a lease."""
     ports = {name: free_port() for name in HOSTS}
-    hosts = {name: Host(tmp_path, name) for name in HOSTS}
+    hosts = {name: Host(tmp_path, name, make_process) for name in HOSTS}
     security = '[security]\nkeys = "keys"\noperators = ["ada"]'
     updates = {}
     try:
