@@ -262,6 +262,11 @@ class ShardHost:
         """Return the identity of a session; "" if unknown.  Takes no mutex."""
         return self._shard.state.sessions.owner(session) or ""
 
+    def owners(self) -> dict[str, str]:
+        """Return the identity of each session."""
+        with self._mutex:
+            return {one.session: one.identity for one in self._shard.state.sessions}
+
     def knows(self, identity: str) -> bool:
         """Whether an identity has a session here.  Takes no mutex."""
         return bool(self._shard.state.sessions.of(identity))

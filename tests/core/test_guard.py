@@ -12,7 +12,7 @@ from enact_dist.core.protocol.datum import Token
 from enact_dist.core.protocol.messages import Hello, Refused, WriteItem
 from enact_dist.core.protocol.records import Recovered
 from enact_dist.core.rights.guard import NOTED_MAX
-from enact_dist.core.rights.rules import Rights, Rule, data_path
+from enact_dist.core.rights.rules import UNPROVEN, Rights, Rule, data_path
 from enact_dist.core.shard.shard import Shard
 from enact_dist.terms import Access
 
@@ -264,6 +264,96 @@ def test_new_rights_hold_from_the_next_message_on():
     )  # fmt: skip
     with pytest.raises(ValueError, match="without rights"):
         plain.take_rights(bench.rights)
+
+
+def test_a_request_asked_again_shows_nothing_that_is_no_longer_readable():
+    """A held lock is found by its name, so what it holds counts, not what the copy asks for."""
+    bench = GuardedBench(read="online:**", write="online:piece/count")
+    bench.put("secret")
+    both = (item(Access.WRITE), item(Access.VIEW, "secret"))
+    granted = bench.asked(bench.acquire_request(lock_id("cam"), *both))
+    assert [state.slot.entity for state in granted.states] == ["piece", "secret"]
+    waits = bench.acquire_request(lock_id("host"), item(Access.WRITE, "secret"), wait_ns=0)
+    assert isinstance(bench.ask(waits), m.Granted)
+    queued = bench.acquire_request(lock_id("cam", lane=1), item(Access.READ, "secret"), wait_ns=0)
+    assert isinstance(bench.asked(queued), m.Waiting)
+
+    bench.shard.take_rights(Rights([rule(write="online:piece/count")], hint="cell.toml, line 41"))
+    assert refused(
+        bench.asked(bench.acquire_request(lock_id("cam"), *both)), "read", "online:secret/count"
+    )
+    for lane in (0, 1):
+        for items in ((), (item(Access.WRITE),)):
+            again = bench.acquire_request(lock_id("cam", lane=lane), *items, wait_ns=0)
+            assert refused(bench.asked(again), "read", "online:secret/count")
+
+
+def test_a_view_under_the_name_of_a_held_lock_needs_its_own_right():
+    bench = GuardedBench(write="online:piece/count")
+    assert isinstance(bench.acquired(Access.WRITE), m.Granted)
+    hidden = (item(Access.VIEW, "secret"),)
+    view = m.TakeView(lock_id("cam"), bench.shard.epoch, PLACEMENT.version, 9, hidden, 0)
+    assert refused(bench.asked(view), "read", "online:secret/count")
+
+
+def test_a_name_without_proof_has_no_part_of_what_everybody_may():
+    rights = Rights([Rule(("*",), (("change", "**"), ("read", "**")))])
+    assert rights.may_write_some("anybody", "**")
+    assert not rights.may_write_some(UNPROVEN, "**")
+    bench = GuardedBench()
+    bench.shard.take_rights(rights)
+    for message in (m.Stage("cam", "cam-1", 0, 9, datum()), m.Register("cam", (), (ASPECTS[0],))):
+        assert bench.shard.denied(message, CAM, None).code == "unproven"
+        assert bench.shard.denied(message, CAM, "cam") is None
+
+
+@pytest.mark.parametrize(
+    "readable", [("online:view/**",), ("online:*/**", "online:**/count"), ("*:**/count",)]
+)
+def test_a_world_of_which_a_part_is_readable_cannot_be_forked(readable):
+    """Its fork would be another world, with other rules; parts of several rules make no whole."""
+    bench = GuardedBench(read=readable, fork="online/*")
+    fork = m.Fork("cam", "copy", "online", bench.wall_ns, epoch=bench.shard.epoch, count=9)
+    assert refused(bench.asked(fork), "read", "online:**")
+    assert "copy" not in bench.shard.state.catalogue.worlds
+    for source, world in (("*", "copy"), ("online/x", "copy"), ("onlin*", "copy"), ("**", "c")):
+        assert isinstance(bench.asked(replace(fork, source=source, world=world)), Refused)
+
+
+HOSTILE = ("*", "**", "\0", "online/count/piece", "count/secret", "a@b", "%2A", "", "../secret")
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_no_text_of_a_request_reaches_beyond_a_rule(text):
+    """Worlds, aspects and entities that are patterns, paths or nothing: refused, or null."""
+    bench = GuardedBench(read="online:piece/count", write="online:piece/count", fork="online/c*")
+    bench.put("secret")
+    for number, access in enumerate(Access, 1):
+        for place in range(3):
+            names = ["online", "secret", "count"]
+            names[place] = text
+            wanted = m.Item(int(access), names[0], names[1], names[2])
+            lock = lock_id("cam", seq=10 * number + place)
+            view = m.TakeView(lock, bench.shard.epoch, PLACEMENT.version, 1, (wanted,), 0)
+            for message in (bench.acquire_request(lock, wanted, wait_ns=0), view):
+                answer = bench.asked(message)
+                assert isinstance(answer, Refused), (message, answer)
+    assert bench.shard.state.tenures.by_lock == {}
+
+
+def test_what_another_session_has_pinned_is_not_fetched():
+    """Neither under its lock, nor under one's own."""
+    bench = GuardedBench(write="online:piece/count")
+    bench.put("secret")
+    bench.ask_as("ada@h:2", Hello("ada", 0, 2 * S, "ada", "h", 2, False))
+    pinned = bench.acquire_request(lock_id("ada"), item(Access.READ, "secret"))
+    assert isinstance(bench.ask_as("ada@h:2", pinned), m.Granted)
+    fetch = m.Fetch(lock_id("ada"), bench.shard.epoch, slot("secret"), 1, 0, 9)
+    assert isinstance(bench.ask_as("ada@h:2", fetch), m.Slice)
+    answer = bench.asked(fetch)
+    assert answer.text == "session ada belongs to ada@h:2; cam@h:1 asked and may not speak for it"
+    answer = bench.asked(replace(fetch, lock=lock_id("cam")))
+    assert refused(answer, "read", "online:secret/count")
 
 
 def test_the_log_names_a_subject_and_a_right_once_a_second():

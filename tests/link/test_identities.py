@@ -240,6 +240,36 @@ def test_revoked_key_ends_its_sessions_and_lets_nobody_in(cell, capsys):
     assert split_common_name(common_name("ben", 1)) == ("ben", 1)
 
 
+def test_bar_ends_the_sessions_of_a_name_whatever_tokens_it_declares(cell, capsys):
+    """One for another's session does not end that one, and none at all keeps no session."""
+    with (
+        cell.running() as shard,
+        cell.running("right"),
+        connect(cell.file, actor="ada") as victim,
+        RawZenoh(cell.config, keys=cell.files("ben")) as raw,
+    ):
+        raw.welcome("left", session_of("ben"), identity=BEN, actor="ben")
+        count = Write(victim.world("online"), Entity("bench"), COUNT)
+        with Lock(count) as lock:
+            session = next(one.session for one in victim.actors() if one.actor == "ada")
+            token = raw.session.liveliness().declare_token(token_key("locked", BEN, session))
+            end_s = time.monotonic() + 10.0
+            while (session, BEN) not in shard._service.present and time.monotonic() < end_s:
+                time.sleep(0.01)
+            assert {identity for one, identity in shard._service.present if one == session} == {
+                BEN,
+                shard.host.owner_of(session),
+            }
+            assert main(["cell", "keys", "revoke", "ben", "--cell", str(cell.file)]) == 0
+            assert shard.reload()
+            assert counters(shard)["sessions_barred"] == 1
+            assert not shard.host.knows(BEN)
+            lock[count] = 1
+        token.undeclare()
+        assert raw.ask("left", hello(OTHER, actor="ben"), actor=BEN, timeout_s=1) is None
+        assert [one.session for one in victim.actors() if one.actor == "ada"] == [session]
+
+
 def test_rights_follow_the_key_and_a_reload(tmp_path):
     """Over the network as over a socket; a file that cannot be used leaves the old rights."""
     cell = key_cells.KeyCell(tmp_path, more=RIGHTS)

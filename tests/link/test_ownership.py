@@ -14,7 +14,7 @@ from enact_dist.errors import PermissionDeniedError, ProtocolError
 from enact_dist.link.memory import payload_desk
 from enact_dist.link.refusals import error_of
 from enact_dist.link.socket import service as socket_service
-from enact_dist.link.socket.frames import FrameKind
+from enact_dist.link.socket.frames import FrameKind, Stream, greeting_of, send_frame
 from enact_dist.link.zenoh.config import MESSAGE_BYTES_MAX, close_session, open_session
 from enact_dist.link.zenoh.queries import wait_connected
 from enact_dist.wire.frames import decode_frame, encode_frame
@@ -136,6 +136,20 @@ def test_connection_speaks_for_its_own_session_only(raw, make_peer):
     assert isinstance(welcome, m.Welcome)
     assert {answer.code for answer in (*forged, finish)} == {"permission"}
     assert [session.session for session in sessions.sessions] == ["yours"]
+
+
+def test_connection_in_the_name_of_a_shard_is_refused(raw):
+    """Shards call each other over Zenoh, where a certificate proves their name."""
+    near = raw(greet=False)
+    send_frame(near, greeting_of("mine", "shard.far"), kind=FrameKind.OPEN)
+
+    kind, header, _ = Stream(near).receive()
+
+    assert kind == FrameKind.REFUSED
+    assert b"called itself shard.far; shards call each other over Zenoh" in bytes(header)
+    actor = raw(greet=False)  # an actor of such a name is none
+    send_frame(actor, greeting_of("mine", "shard.far@h:1"), kind=FrameKind.OPEN)
+    assert Stream(actor).receive()[0] == FrameKind.OPENED
 
 
 @both

@@ -128,6 +128,12 @@ def test_a_user_without_an_entry_is_refused_by_number(tmp_path):
         assert subject_of("camera@h:1", PeerCredentials(7, 1002, 1)) == "@cams"
         with pytest.raises(LinkError, match="called itself logger, which is another name"):
             subject_of("logger@h:1", PeerCredentials(7, 1001, 1))
+        for name in ("logger:tool", "ada:probe", "logger%3Atool"):
+            with pytest.raises(LinkError, match="which is another name of the cell"):
+                subject_of(f"{name}@h:1", PeerCredentials(7, 1001, 1))
+        assert subject_of("camera:tool@h:1", PeerCredentials(7, 1001, 1)) == "camera"
         assert subject_of("a%20b@h:1", PeerCredentials(7, 0, 0)) == "a b"
+        with pytest.raises(LinkError, match="user 0 of process 7 has no rights"):
+            subject_of("@h:1", PeerCredentials(7, 0, 0))
         with pytest.raises(LinkError, match="user 1003 of process 7 has no rights at shard s"):
             subject_of("camera@h:1", PeerCredentials(7, 1003, 1))

@@ -111,7 +111,7 @@ class Guard:
         """
         kind = type(message)
         if isinstance(message, Acquire | TakeView):
-            return self._items(message.items)
+            return self.refusal_of(message.items)
         if isinstance(message, Register):
             return self._register(message, worlds)
         if isinstance(message, Fork):
@@ -135,7 +135,8 @@ class Guard:
         may = self.rights.may(self.subject, right, path)
         return None if may else self.denied(right, what)
 
-    def _items(self, items: Iterable[Item]) -> Refused | None:
+    def refusal_of(self, items: Iterable[Item]) -> Refused | None:
+        """Return why the present subject may not have a lock or view of these items, else None."""
         rights, subject = self.rights, self.subject
         for item in items:
             access = ACCESSES.get(item.access)

@@ -164,7 +164,7 @@ class Rights:
         """Say whether a subject may write anything at all of what a path pattern covers."""
         if subject == "" or subject in self.operators:
             return True
-        given = self._given(subject)
+        given = self._given(subject) if subject != UNPROVEN else {}
         return any(
             patterns_overlap(pattern, path)
             for right in WRITING

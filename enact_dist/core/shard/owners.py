@@ -71,6 +71,11 @@ def shard_identity(shard: str) -> str:
     return _SHARD + shard
 
 
+def is_shard(identity: str) -> bool:
+    """Whether an identity is that of a shard; that of a client names its host, too."""
+    return identity.startswith(_SHARD) and "@" not in identity
+
+
 def _session_getter(kind: type) -> Callable[[object], str] | None:
     fields = {field.name for field in dataclasses.fields(kind)}
     path = "lock.session" if "lock" in fields else "session" if "session" in fields else ""

@@ -260,6 +260,9 @@ class Shard:
             session = state.sessions.by_id.get(message.lock.session)
             if message.epoch != state.epoch or session is None or not session.present:
                 return None  # its answer is that the epoch has changed
+            known = state.tenures.by_lock.get(message.lock)
+            if known is not None and type(message) is Acquire:
+                return state.guard.refusal_of(known.items)  # whatever this copy asks for
         return state.guard.refusal(message, state.catalogue.worlds)
 
     def take_rights(self, rights: Rights) -> None:

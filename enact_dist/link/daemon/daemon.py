@@ -48,7 +48,7 @@ from enact_dist.link.zenoh.service import ZenohService
 from enact_dist.wire.keys import name_in
 
 if TYPE_CHECKING:
-    from collections.abc import Container, Mapping
+    from collections.abc import Container, Iterable
 
     import zenoh
 
@@ -188,12 +188,11 @@ class RunningShard:
             self._failure = error
             self._ended.set()
             raise
-        present = dict(before.present)
-        for session in [one for one, identity in present.items() if name_in(identity) in barred]:
-            self.host.event(SessionBarred(session))
-            del present[session]
+        for session, identity in self.host.owners().items():
+            if name_in(identity) in barred:
+                self.host.event(SessionBarred(session))
         grace_s = self.settings.link_lease_s + RECONNECT_S
-        timer = threading.Timer(grace_s, self._report_absent, (present,))
+        timer = threading.Timer(grace_s, self._report_absent, (tuple(before.present),))
         timer.daemon = True
         timer.start()
 
@@ -207,10 +206,10 @@ class RunningShard:
                     raise
                 time.sleep(REOPEN_PAUSE_S)
 
-    def _report_absent(self, before: Mapping[str, str]) -> None:
+    def _report_absent(self, before: Iterable[tuple[str, str]]) -> None:
         """Report the tokens that have not come back: their clients ended during a reload."""
-        for session, identity in before.items():
-            if not self._stopped and session not in self._service.present:
+        for session, identity in before:
+            if not self._stopped and (session, identity) not in self._service.present:
                 self.host.event(SessionSeen(session, present=False, identity=identity))
 
     @property

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.records import SessionDied
-from enact_dist.core.shard.owners import not_yours
+from enact_dist.core.shard.owners import is_shard, not_yours
 from enact_dist.errors import LinkError
 from enact_dist.link.socket.connection import SocketConnection
 from enact_dist.link.socket.frames import end_socket, prefixed
@@ -119,11 +119,16 @@ class SocketService:
         """
         peer = check_peer(connection.connected, users=self._users, group=self._access.group)
         connection.peer = peer
-        connection.subject = self._subject_of(connection.identity, peer)
         owner, asker = self.host.owner_of(session), connection.identity
+        if is_shard(asker):  # any process of the group could decide commits in its name
+            raise LinkError(
+                f"process {peer.pid} of user {peer.user} called itself {asker}; shards call each"
+                " other over Zenoh"
+            )
         if owner and owner != asker:  # else the end of this process would end that session
             raise LinkError(not_yours(session, owner, asker).text)
         with self._mutex:
+            connection.subject = self._subject_of(asker, peer)  # in one step with `take_rights`
             mine = self._connections.get(session, set())
             problem = self._problem_with(session, mine, peer)
             crowded = not problem and self._has_its_share(peer)
@@ -169,6 +174,7 @@ class SocketService:
                 f"user {peer.user} of process {peer.pid} has no rights at shard {self.host.name};"
                 f" add it to `uids`: {rights.hint}"
             )
+        name = name.partition(":")[0]  # behind it is the word of a program of that name
         trusted = peer.user in self._users or subject in rights.operators
         if not trusted and name in rights.known and not rights.means(subject, name):
             raise LinkError(

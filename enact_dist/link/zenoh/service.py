@@ -91,7 +91,7 @@ class ZenohService:
     Attributes:
         senders: Sends the answers.
         count: Adds to a counter of the shard.
-        present: The sessions whose tokens are there, each with its identity.
+        present: The tokens that are there: a session, and the identity that says it is there.
     """
 
     def __init__(
@@ -103,7 +103,7 @@ class ZenohService:
         self.count = host.count
         self.senders = Senders(host.count)
         self._closed = False
-        self.present: dict[str, str] = {}
+        self.present: set[tuple[str, str]] = set()
         keep_after_fork(self)
         recycle_blocks()
         self._publisher = session.declare_publisher(
@@ -327,10 +327,7 @@ class ZenohService:
                 identity, session = token_of(str(sample.key_expr))
                 if session:
                     present = sample.kind == zenoh.SampleKind.PUT
-                    if present:
-                        self.present[session] = identity
-                    else:
-                        self.present.pop(session, None)
+                    (self.present.add if present else self.present.discard)((session, identity))
                     self._host.event(SessionSeen(session, present, identity))
         except zenoh.ZError:
             return
