@@ -48,7 +48,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.config.environment import with_environment
 from enact_dist.config.lines import LineLocator
-from enact_dist.config.rights_check import check_rights, refuse_unproven_names
+from enact_dist.config.rights_check import check_clients, check_rights, refuse_unproven_names
 from enact_dist.config.table import ConfigSource, Table, suggestion
 from enact_dist.config.types import (
     ActorProcess,
@@ -118,6 +118,7 @@ def parse_config(
     config = _cell(root, file)
     config = with_environment(config, os.environ if environment is None else environment)
     _check_doors(root, config)
+    check_clients(root, config)
     refuse_unproven_names(root, config)
     return config
 

@@ -25,6 +25,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -48,6 +49,9 @@ if TYPE_CHECKING:
 DEFAULTS: Final = ("declared", "none")
 RIGHTS_FILE: Final = "rights.toml"
 """Name of the file with what follows from the declarations, beside the `cell.toml`."""
+NAME_MAX: Final = 60
+"""X.509 has room for 64 characters of a name, of which `~N` takes some once keys were revoked, and
+an identity has as much."""
 _USER: Final = re.compile(r"uid:\d{1,10}\Z")
 REMEDY: Final = "write it with enact actor check --rights"
 
@@ -137,7 +141,9 @@ class RightsConfig:
     default: Annotated[str, TableKey(choices=DEFAULTS)] = "declared"
     uids: Mapping[str, str] = field(default_factory=dict)
     groups: Mapping[str, object] = field(default_factory=dict)
-    programs: tuple[str, ...] = ()
+    programs: Annotated[
+        tuple[str, ...], TableKey(make=partial(checked_name, "program", slashes=False))
+    ] = ()
     observe: tuple[str, ...] = ("*",)
     allow: Annotated[tuple[AllowTable, ...], TableKey(table=AllowTable)] = ()
 

@@ -5,15 +5,17 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.config.rights import DATA_LISTS, NAMED_LISTS
+from enact_dist.config.rights import DATA_LISTS, NAME_MAX, NAMED_LISTS
 from enact_dist.config.table import suggestion
 from enact_dist.core.rights.rules import fork_path
+from enact_dist.core.shard.owners import shard_identity
 
 if TYPE_CHECKING:
     from enact_dist.config.rights import AllowTable
     from enact_dist.config.table import Table
     from enact_dist.config.types import CellConfig
 
+SHARD_PREFIX: Final = shard_identity("")
 _LOOPBACK: Final = re.compile(r"tcp/(127\.\d+\.\d+\.\d+|\[::1\]|localhost):\d+\Z")
 
 
@@ -35,7 +37,7 @@ def check_rights(root: Table, config: CellConfig) -> None:
                 table.table("groups").refuse(group, problem)
             _check_name(table.table("groups"), group, member, config)
     for uid, name in config.rights.uids.items():
-        if not uid.isdecimal() or name.startswith("shard."):
+        if not uid.isdecimal() or name.startswith(SHARD_PREFIX) or "*" in name:
             problem = f'{uid!r} = {name!r} is no user with a name; write 1001 = "camera"'
             table.table("uids").refuse(uid, problem)
         if name.startswith("@"):
@@ -50,6 +52,36 @@ def check_rights(root: Table, config: CellConfig) -> None:
         if one in seen:
             rule.refuse("who", f"rule {number} of [[rights.allow]] repeats rule {seen[one]}")
         seen[one] = number
+
+
+def check_clients(root: Table, config: CellConfig) -> None:
+    """Refuse names of clients that could be taken for others, where names prove something.
+
+    Raises:
+        ConfigError: One is kept for shards or the authority, or is too long.
+    """
+    has_keys = config.security.keys is not None
+    if not has_keys and config.rights is None:
+        return
+    cannot = f"cannot have {'a key' if has_keys else 'rights'}"
+    for name in config.key_holders:
+        problem = ""
+        if name.startswith(SHARD_PREFIX) or name == "ca":
+            problem = (
+                f"{name!r} {cannot}: 'ca' and names that begin with {SHARD_PREFIX!r} belong to the"
+                " authority and to shards; choose another name"
+            )
+        elif len(name) > NAME_MAX:
+            problem = (
+                f"{name!r} {cannot}: a certificate has room for {NAME_MAX} characters of a name;"
+                " choose a shorter one"
+            )
+        if problem and name in config.actor_names:
+            root.table("actors").refuse(name, problem)
+        elif problem and name in config.security.operators:
+            root.table("security").refuse("operators", problem)
+        elif problem:
+            root.table("rights").refuse("programs", problem)
 
 
 def refuse_unproven_names(root: Table, config: CellConfig) -> None:

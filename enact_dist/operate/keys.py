@@ -51,8 +51,6 @@ if TYPE_CHECKING:
 AUTHORITY_DAYS: Final = 3650
 SHARD_DAYS: Final = 730
 CLIENT_DAYS: Final = 365
-NAME_MAX: Final = 60
-"""X.509 has room for 64 characters of a name, of which `~N` takes some once keys were revoked."""
 EARLIER: Final = dt.timedelta(minutes=5)
 """Certificates are valid from a little before they are made: clocks differ."""
 _FILE_MODE, _FOLDER_MODE = 0o600, 0o700
@@ -84,25 +82,13 @@ def owners_of(config: CellConfig) -> tuple[KeyOwner, ...]:
     """Return the shards, actors and operators of a cell, in the order of its file.
 
     Raises:
-        ConfigError: An actor or operator has a name that is too long or kept for shards, or the
-            list of revoked keys cannot be used.
+        ConfigError: The list of revoked keys cannot be used.
     """
     revoked = read_revoked(config.security.keys) if config.security.keys is not None else {}
     shards = [
         KeyOwner(shard_identity(one.name), _hosts_of((*one.listen, *one.advertise)))
         for one in config.shards
     ]
-    for name in config.key_holders:
-        if name.startswith(SHARD_PREFIX) or f"{name}.pem" == AUTHORITY:
-            raise ConfigError(
-                f"{config.path}: {name!r} cannot have a key: 'ca' and names that begin with"
-                f" {SHARD_PREFIX!r} belong to the authority and to shards; choose another name"
-            )
-        if len(name) > NAME_MAX:
-            raise ConfigError(
-                f"{config.path}: {name!r} cannot have a key: a certificate has room for"
-                f" {NAME_MAX} characters of a name; choose a shorter one"
-            )
     return (*shards, *(KeyOwner(name, revoked=revoked.get(name, 0)) for name in config.key_holders))
 
 

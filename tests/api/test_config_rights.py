@@ -139,6 +139,32 @@ def test_rights_where_any_program_can_claim_any_name_are_refused(old, new, wrong
         )
 
 
+@pytest.mark.parametrize(
+    "name", ["*", "@vision", "-", "ada~1", "ada:x", "ada@h", "a/b", "a%20b", "ümlaut", "a" * 201]
+)
+def test_program_has_a_name_that_is_nobody_elses(name):
+    """`ada~1` is what the next certificate of ada says, `-` a client that proves no name."""
+    wrong = refused(CELL + RIGHTS.replace('programs = ["logger"]', f'programs = ["{name}"]'))
+    assert "line 15: " in wrong
+    assert "program" in wrong
+
+
+@pytest.mark.parametrize(
+    ("old", "line"), [("actors.planner", 8), ('"ada"', 11), ('programs = ["logger', 14)]
+)
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [("shard.s", "belong to the authority and to shards"), ("a" * 61, "60 characters of a name")],
+)
+def test_names_that_two_could_have_are_refused(old, line, name, wrong):
+    """An identity has room for 64 characters, so of two long names one could be the other."""
+    text = CELL + '[rights]\ndefault = "none"\nprograms = ["logger"]\n'
+    new = {8: f'actors."{name}"', 11: f'"{name}"', 14: f'programs = ["{name}'}[line]
+    found = refused(text.replace(old, new, 1))
+    assert f"line {line}: '{name}' cannot have rights: " in found
+    assert wrong in found
+
+
 def test_the_tables_are_tables():
     assert "'rights' is a table" in refused("rights = 3\n" + CELL)
     assert "'security' is a table" in refused("security = 3\n" + CELL.partition("[security]")[0])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import threading
 from contextlib import contextmanager
 
 import pytest
@@ -9,10 +11,12 @@ from ports import free_endpoint
 
 from enact_dist import Aspect, Durability, Entities, Entity, Lock, View, Write, connect
 from enact_dist.config.read import load_config
+from enact_dist.core.rights.rules import Rights
 from enact_dist.errors import LinkError, PermissionDeniedError
 from enact_dist.link.daemon.daemon import start_shard
 from enact_dist.link.daemon.settings import DaemonSettings
-from enact_dist.link.socket.peers import PeerCredentials
+from enact_dist.link.socket import service
+from enact_dist.link.socket.peers import PeerCredentials, peer_of
 
 pytestmark = pytest.mark.carrier("auto")
 
@@ -118,6 +122,42 @@ def test_a_watch_over_the_socket_leaves_out_what_is_not_readable(tmp_path):
         changes = [watch.next(5.0) for _ in range(2)]
         assert {change.entity.name for change in changes} == {"view/1"}
         assert watch.next(0.2) is None
+
+
+def test_a_reload_changes_whose_rights_a_connection_uses(tmp_path, monkeypatch):
+    """At once; one whose user has none any more ends, one that is just admitted is no exception."""
+    with guarded(tmp_path) as (shard, file), connect(file, actor="camera") as camera:
+        put(camera, "view/1", 1)
+        sockets = shard._sockets
+        (present,) = [one for mine in sockets._connections.values() for one in mine][:1]
+        monkeypatch.setattr(sockets, "_users", frozenset())  # as if of another user
+        monkeypatch.setattr(service, "check_peer", lambda connected, **_: peer_of(connected))
+        taking = []
+        real = sockets._subject_of
+
+        def found_slowly(identity, peer):
+            subject = real(identity, peer)
+            if not taking:  # a reload begins while a connection is admitted
+                taking.append(threading.Thread(target=take, args=("@cams",)))
+                taking[0].start()
+                taking[0].join(0.2)
+            return subject
+
+        def take(name):
+            shard.host.take_rights(Rights([], users={} if name is None else {os.geteuid(): name}))
+            sockets.take_rights()
+
+        take("camera")
+        assert present.subject == "camera"
+        monkeypatch.setattr(sockets, "_subject_of", found_slowly)
+        with connect(file, actor="camera"):
+            taking[0].join()
+            subjects = {one.subject for mine in sockets._connections.values() for one in mine}
+        assert subjects == {"@cams"}
+        take(None)
+        assert present.ended.wait(5.0)
+        with pytest.raises(LinkError, match="has no rights at shard s"):
+            connect(file, actor="camera", timeout_s=0.2)
 
 
 def test_a_user_without_an_entry_is_refused_by_number(tmp_path):

@@ -25,7 +25,7 @@ from enact_dist.link.zenoh.queries import (
     send_query,
     wait_connected,
 )
-from enact_dist.link.zenoh.tls import SHARD_PREFIX, why_refused
+from enact_dist.link.zenoh.tls import SHARD_PREFIX, refusals, why_refused
 from enact_dist.wire.keys import ANY, NAMELESS, identity_of, parse_request_key, request_key, verb_of
 
 if TYPE_CHECKING:
@@ -39,6 +39,9 @@ if TYPE_CHECKING:
 
 PROBE_LEASE_S: Final = 1.0
 """Link lease of the short sessions that only look for shards."""
+CONNECTED_S: Final = 0.1
+"""After this time without a connection we look whether certificates are the reason, and after
+twice as long again."""
 AT_ONCE_S: Final = 0.05
 BARRED_COUNT: Final = 5
 """A shard that bars our name ends each query at once; one that opens again does so only briefly."""
@@ -74,17 +77,18 @@ def discover(
     """Say hello to the first shard that answers; return its cell's name and its welcome.
 
     Raises:
-        ShardUnreachableError: None answered within `timeout_s`; the message says so if a
-            certificate was refused.
+        ShardUnreachableError: None answered within `timeout_s`, or certificates are refused at all
+            endpoints, which the message explains.
         ConfigError: An endpoint cannot be read, or the keys for one cannot be used.
         ProtocolError: An answer cannot be read, or does not answer a hello.
         PermissionDeniedError: The shard admits no client with our key.
     """
-    deadline_s = time.monotonic() + timeout_s
+    began_s = time.monotonic()
+    deadline_s = began_s + timeout_s
     silent, ended_at_once = "", 0
     with _probe(endpoints, timeout_s, keys) as probe:
-        while time.monotonic() < deadline_s:
-            for found in probe.find(deadline_s):
+        while shards := probe.find(deadline_s):
+            for found in shards:
                 silent = found.shard
                 asked_s = time.monotonic()
                 answer = probe.greet(found, hello, deadline_s)
@@ -109,8 +113,9 @@ def discover(
         )
     unknown = ", ".join(unknown_hosts(endpoints))
     refused = why_refused(endpoints, keys)
+    waited_s = min(timeout_s, round(time.monotonic() - began_s, 1))
     raise ShardUnreachableError(
-        f"no shard answers at {where} (waited {timeout_s:g} s);"
+        f"no shard answers at {where} (waited {waited_s:g} s);"
         + (f" the host name {unknown} cannot be resolved;" if unknown else "")
         + (f" {refused}" if refused else " is one running there? (enact shard run, enact doctor)"),
         endpoint=where,
@@ -137,6 +142,8 @@ def ask_shards(
     asker = keys.name if keys is not None and is_shard else NAMELESS
     answers: dict[FoundShard, Answer] = {}
     with _probe(endpoints, timeout_s, keys) as probe:
+        if keys is not None and not probe.connected(deadline_s):
+            return {}
         while (left_s := deadline_s - time.monotonic()) > 0 and len(answers) < len(shards):
             # A hung shard must leave the others time for a second query after they connect.
             wait_s = max(SHORTEST_S, left_s / 2)
@@ -158,7 +165,8 @@ def _probe(endpoints: Sequence[str], timeout_s: float, keys: KeyFiles | None) ->
     """Open a short session that only looks for shards."""
     session = open_session(connect=endpoints, lease_s=PROBE_LEASE_S, open_s=timeout_s, keys=keys)
     try:
-        yield _Probe(session, keys, ServerNames(session) if keys is not None else None)
+        names = ServerNames(session) if keys is not None else None
+        yield _Probe(session, endpoints, keys, names)
     finally:
         close_session(session)
 
@@ -168,12 +176,24 @@ class _Probe:
     """A short session, our keys, and what checks the names of those that answer on it."""
 
     session: zenoh.Session
+    endpoints: Sequence[str]
     keys: KeyFiles | None
     names: ServerNames | None
 
+    def connected(self, deadline_s: float) -> bool:
+        """Wait for a connection; False if time is up or certificates are refused everywhere."""
+        wait_s = CONNECTED_S if self.keys is not None else float("inf")
+        while (left_s := deadline_s - time.monotonic()) > 0:
+            if wait_connected(self.session, min(wait_s, left_s)):
+                return True
+            if len(refusals(self.endpoints, self.keys)) == len(set(self.endpoints)):
+                break
+            wait_s *= 2
+        return False
+
     def find(self, deadline_s: float) -> tuple[FoundShard, ...]:
-        """Query until a shard has answered or time is up."""
-        if not wait_connected(self.session, deadline_s - time.monotonic()):
+        """Query until a shard has answered; nothing if none will, or time is up."""
+        if not self.connected(deadline_s):
             return ()
         key = request_key(ANY, ANY, verb_of(QUESTION), NAMELESS)
         while (left_s := deadline_s - time.monotonic()) > 0:

@@ -17,7 +17,7 @@ import socket
 import ssl
 import threading
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -172,6 +172,11 @@ class Certificate:
             )
         return ""
 
+    def validity(self, now_s: float) -> str:
+        """Return from when to when it is valid, and what this host's clock says."""
+        times = f"valid from {day_of(self.starts_s)} to {day_of(self.ends_s)}"
+        return f"{times}, and this host's clock says {day_of(now_s)}"
+
 
 def day_of(unix_s: float) -> str:
     """Return a time for people."""
@@ -283,14 +288,12 @@ class TlsLook:
         endpoint: Where.
         reason: Why a connection is refused, by either side; empty if none is.
         certificate: The certificate there, if it could be read.
-        encoded: That certificate as bytes.
         listens: Whether anything listens there.
     """
 
     endpoint: str
     reason: str = ""
     certificate: Certificate | None = None
-    encoded: bytes = field(default=b"", repr=False)
     listens: bool = True
 
 
@@ -300,25 +303,48 @@ def look(endpoint: str, keys: KeyFiles, *, wait_s: float = LOOK_S) -> TlsLook:
     Raises:
         ConfigError: The own files cannot be used.
     """
-    host, port = split_endpoint(endpoint)[1].strip("[]"), split_endpoint(endpoint)[2]
-    own = own_certificate(keys)
-    context, end_s = keys.context(), time.monotonic() + wait_s
-    found, encoded = None, b""
+    own, context, end_s = own_certificate(keys), keys.context(), time.monotonic() + wait_s
     try:
-        with socket.create_connection((host, int(port)), wait_s) as plain:
-            plain.settimeout(max(0.01, end_s - time.monotonic()))
-            with context.wrap_socket(plain, server_hostname=host) as line:
-                found = certificate_of(line.getpeercert() or {})
-                encoded = line.getpeercert(binary_form=True) or b""
-                line.settimeout(max(0.01, min(ALERT_S, end_s - time.monotonic())))
-                with contextlib.suppress(TimeoutError):
-                    line.recv(1)
-    except (ssl.SSLError, ConnectionResetError) as error:
-        reason = _reason(error, host, keys, own)
-        return TlsLook(endpoint, reason, found, encoded)
+        found, error = _shown(endpoint, context, end_s)
     except (OSError, ValueError):
         return TlsLook(endpoint, listens=False)
-    return TlsLook(endpoint, "", found, encoded)
+    if error is None:
+        return TlsLook(endpoint, "", found)
+    if found is None and _is_of_time(error):
+        context.verify_flags |= _ANY_TIME
+        with contextlib.suppress(OSError):
+            found, _ = _shown(endpoint, context, end_s, for_alert=False)
+    return TlsLook(endpoint, _reason(error, endpoint, keys, own, found), found)
+
+
+def _shown(
+    endpoint: str, context: ssl.SSLContext, end_s: float, *, for_alert: bool = True
+) -> tuple[Certificate | None, OSError | None]:
+    """Make a handshake; return the certificate that was shown, and why the handshake failed.
+
+    With `for_alert` it waits until the shard has had time to refuse our certificate.
+
+    Raises:
+        OSError: Nothing answers in time.
+        ValueError: The endpoint has no port.
+    """
+    _, host, port = split_endpoint(endpoint)
+    host, found = host.strip("[]"), None
+
+    def left_s() -> float:
+        return max(0.01, end_s - time.monotonic())
+
+    try:
+        with socket.create_connection((host, int(port)), left_s()) as plain:
+            plain.settimeout(left_s())
+            with context.wrap_socket(plain, server_hostname=host) as line:
+                found = certificate_of(line.getpeercert() or {})
+                line.settimeout(min(ALERT_S, left_s()))
+                with contextlib.suppress(TimeoutError):
+                    _ = line.recv(1) if for_alert else b""
+    except (ssl.SSLError, ConnectionResetError) as error:
+        return found, error
+    return found, None
 
 
 def _cause(error: OSError) -> str:
@@ -326,15 +352,28 @@ def _cause(error: OSError) -> str:
     return str(found).lower().replace("_", " ").removeprefix("tlsv1 ").removeprefix("sslv3 ")
 
 
-def _reason(error: OSError, host: str, keys: KeyFiles, own: Certificate) -> str:
+def _is_of_time(error: OSError) -> bool:
+    """Whether a certificate is refused because it is not valid now."""
+    return any(part in _cause(error) for part in ("expired", "not yet valid"))
+
+
+def _reason(
+    error: OSError, endpoint: str, keys: KeyFiles, own: Certificate, theirs: Certificate | None
+) -> str:
     """Return why a handshake has failed, and what to do."""
-    cause = _cause(error)
+    cause, now_s = _cause(error), time.time()
     if isinstance(error, ssl.SSLCertVerificationError):
         remedy = next((text for part, text in _THEIRS.items() if part in cause), "")
+        if theirs is not None and _is_of_time(error):
+            remedy = f"; it is {theirs.validity(now_s)}{remedy}"
+        host = split_endpoint(endpoint)[1].strip("[]")
         return f"its certificate is refused here: {cause}{remedy.format(host=host)}"
     if "alert" in cause:
-        problem = own.problem(time.time())
-        remedy = f"; it {problem}" if problem else ""
+        remedy = ""
+        if problem := own.problem(now_s):
+            remedy = f"; it {problem}"
+        elif _is_of_time(error):
+            remedy = f"; it is {own.validity(now_s)}; correct the clock of the shard's host"
         if "unknown ca" in cause:
             remedy = "; the shard's ca.pem is of another authority than this certificate"
         return f"the shard refuses our certificate {keys.certificate}: {cause}{remedy}"
@@ -345,14 +384,23 @@ _THEIRS: Final = {
     "mismatch": "; name {host} in `listen` or `advertise` of the shard and renew its certificate",
     "local issuer": "; another authority than that of our ca.pem has made it",
     "self-signed": "; another authority than that of our ca.pem has made it",
-    "expired": "; renew it, and reload the shard (enact cell keys renew, enact shard reload)",
-    "not yet valid": "; compare the clocks of this host and of the one that made it",
+    "expired": "; renew it, and reload the shard (enact cell keys renew, enact shard reload), or"
+    " correct the clock of this host",
+    "not yet valid": "; correct the clock of this host, or of the one that made it",
     "purpose": "; it is not one of a shard",
 }
 
 
 def why_refused(endpoints: Iterable[str], keys: KeyFiles | None, shard: str = "") -> str:
     """Return why no connection comes about at TLS endpoints; empty if TLS is not the reason.
+
+    See `refusals` for the arguments.
+    """
+    return "; ".join(f"{place}: {why}" for place, why in refusals(endpoints, keys, shard).items())
+
+
+def refusals(endpoints: Iterable[str], keys: KeyFiles | None, shard: str = "") -> dict[str, str]:
+    """Return the TLS endpoints where a certificate is refused, each with the reason.
 
     Takes at most `LOOK_S`, whatever a name server does.
 
@@ -362,9 +410,9 @@ def why_refused(endpoints: Iterable[str], keys: KeyFiles | None, shard: str = ""
         shard: The shard that is expected there; empty: any.
     """
     places = [one for one in dict.fromkeys(endpoints) if one.startswith("tls/")]
-    if keys is None or not places:
-        return ""
-    found: queue.SimpleQueue[str] = queue.SimpleQueue()
+    if keys is None:
+        return {}
+    found: queue.SimpleQueue[tuple[str, str]] = queue.SimpleQueue()
 
     def look_at(endpoint: str) -> None:
         try:
@@ -372,16 +420,17 @@ def why_refused(endpoints: Iterable[str], keys: KeyFiles | None, shard: str = ""
             reason = seen.reason or wrong_name(seen.certificate, shard)
         except ConfigError as error:
             reason = str(error)
-        found.put(f"{endpoint}: {reason}" if reason else "")
+        found.put((endpoint, reason))
 
     for place in places:
         threading.Thread(target=look_at, args=(place,), name="tls-look", daemon=True).start()
-    reasons: list[str] = []
+    reasons: dict[str, str] = {}
     end_s = time.monotonic() + LOOK_S
     while len(reasons) < len(places) and (left_s := end_s - time.monotonic()) > 0:
         with contextlib.suppress(queue.Empty):
-            reasons.append(found.get(timeout=left_s))
-    return "; ".join(filter(None, reasons))
+            place, reason = found.get(timeout=left_s)
+            reasons[place] = reason
+    return {place: reason for place, reason in reasons.items() if reason}
 
 
 def wrong_name(found: Certificate | None, shard: str) -> str:
