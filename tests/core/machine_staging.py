@@ -205,7 +205,9 @@ class Staging:
         lock = self._after("committing", "persisted", choice)
         if lock is None or self.reference.state_of(lock) != "committed":
             return None
-        items = self.plans.items[lock]
+        items = self.plans.items.get(lock)
+        if items is None:  # an earlier step has made its thread go on already
+            return None
         newer = self._ask(lock[:2], items, wait_ns=0, alone=True, choice=choice)
         self._event("commit", newer, choice)
         self._event("persisted", newer, choice)
