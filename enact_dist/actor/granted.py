@@ -8,6 +8,7 @@ from enact_dist.actor.uses import declared_rights
 from enact_dist.config.rights import (
     DATA_LISTS,
     RIGHTS_FILE,
+    array_of,
     compiled_rights,
     text_of_declared,
 )
@@ -80,7 +81,7 @@ def _missing(config: CellConfig, declared: Sequence[AllowTable]) -> Iterator[Rig
             for key in ("read", "write")
         }
         if any(lacks.values()):
-            lines = [f"{key} = {_array(found)}" for key, found in lacks.items() if found]
+            lines = [f"{key} = {array_of(found)}" for key, found in lacks.items() if found]
             text = f'[[rights.allow]]\nwho = "{name}"\n' + "\n".join(lines)
             yield RightsFinding(
                 "right missing",
@@ -116,7 +117,3 @@ def _unused(config: CellConfig, declared: Sequence[AllowTable]) -> Iterator[Righ
                         f" {', '.join(who)}, and none of them declares it; remove it, unless their"
                         " code asks for more than they declare",
                     )
-
-
-def _array(texts: Sequence[str]) -> str:
-    return "[" + ", ".join(f'"{text}"' for text in texts) + "]"

@@ -263,12 +263,13 @@ def text_of_declared(rules: Iterable[AllowTable]) -> str:
     """Return `rights.toml` with these rules."""
     lines = ["# Written by `enact actor check --rights` from what the actors declare; do not edit."]
     for rule in rules:
-        lines += ["", "[[allow]]", f"who = {_array(rule.who)}"]
+        lines += ["", "[[allow]]", f"who = {array_of(rule.who)}"]
         for key in ("read", "write"):
             if found := getattr(rule, key):
-                lines.append(f"{key} = {_array(found)}")
+                lines.append(f"{key} = {array_of(found)}")
     return "\n".join((*lines, ""))
 
 
-def _array(texts: Iterable[str]) -> str:
+def array_of(texts: Iterable[str]) -> str:
+    """Return an array as TOML writes it."""
     return "[" + ", ".join(f'"{text}"' for text in texts) + "]"

@@ -5,13 +5,13 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING
 
+from enact_dist.core.shard.owners import SHARD_PREFIX
 from enact_dist.errors import ConfigError
 from enact_dist.link.zenoh.endpoints import split_endpoint
 from enact_dist.link.zenoh.tls import (
     AUTHORITY_KEY,
     DAY_S,
     RENEW_DAYS,
-    SHARD_PREFIX,
     KeyFiles,
     client_keys,
     day_of,
@@ -99,7 +99,7 @@ def _ending(found: Certificate) -> str:
 
 
 def _shown(shard: str, endpoint: str, files: KeyFiles) -> Iterator[Finding]:
-    """Check the certificate at an endpoint; nothing is said of one where nothing listens."""
+    """Check the certificate at an endpoint; yield nothing where nothing listens."""
     subject = f"key at {shard}"
     seen = look(endpoint, files)
     if not seen.listens:

@@ -20,7 +20,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from enact_dist.core.shard.owners import shard_identity
+from enact_dist.core.shard.owners import SHARD_PREFIX, shard_identity
 from enact_dist.errors import ConfigError, MisuseError
 from enact_dist.link.folder.lock import replace_file
 from enact_dist.link.zenoh.access import (
@@ -36,7 +36,6 @@ from enact_dist.link.zenoh.tls import (
     AUTHORITY_KEY,
     DAY_S,
     RENEW_DAYS,
-    SHARD_PREFIX,
     Certificate,
     KeyFiles,
     hosts_missing,

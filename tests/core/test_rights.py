@@ -133,7 +133,9 @@ def test_a_decision_is_its_plain_definition(all_rules, requests):
     for _ in range(2):
         for subject, (right, path) in requests:
             assert rights.may(subject, right, path) == plainly_may(all_rules, subject, right, path)
-            assert rights.may_write(subject, path) == plainly_may(all_rules, subject, "write", path)
+            assert rights.may(subject, "write", path) == plainly_may(
+                all_rules, subject, "write", path
+            )
 
 
 def test_new_rights_have_no_old_decision_and_old_ones_make_room(monkeypatch):

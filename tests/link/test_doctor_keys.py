@@ -113,6 +113,6 @@ def test_missing_keys_are_named_by_the_doctor(cell):
 
 
 def test_cell_without_keys_has_no_findings(cell):
-    """Nothing is said of keys."""
+    """It reports nothing about keys."""
     cell.file.write_text('name = "open"\n[shards.left]\nlisten = "tcp/127.0.0.1:7447"\n')
     assert list(keys(cell.config)) == []

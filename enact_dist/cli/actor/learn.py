@@ -12,7 +12,7 @@ from enact_dist.cli.target import open_cell
 from enact_dist.cli.text.output import print_json
 from enact_dist.cli.verbs import DONE, UNREACHABLE
 from enact_dist.config.rights import DATA_LISTS, NAMED_LISTS
-from enact_dist.core.rights.rules import UNPROVEN, data_path, fork_path
+from enact_dist.core.rights.rules import UNPROVEN, WRITING, data_path, fork_path
 from enact_dist.errors import ConfigError, LinkError
 from enact_dist.world.trees import shown_s
 
@@ -190,7 +190,7 @@ def _gives(refused: Iterable[LearnedRefusal]) -> tuple[list[str], list[str]]:
     lines = []
     for key in (*_KEYS, *_FLAGS):
         texts = lists.get(key)
-        if texts is not None and key not in ("read", "write") and key in DATA_LISTS:
+        if texts is not None and key in WRITING:
             texts = [text for text in texts if text not in lists.get("write", ())]
         if texts or (key in _FLAGS and texts is not None):
             lines.append(f"{key} = {json.dumps(texts) if texts else 'true'}")

@@ -156,10 +156,6 @@ class Rights:
         found = self._decided.get(key)
         return self._decide(key) if found is None else found
 
-    def may_write(self, subject: str, path: str) -> bool:
-        """Say whether a subject has any of the rights that `write` stands for."""
-        return self.may(subject, WRITE, path)
-
     def may_write_some(self, subject: str, path: str) -> bool:
         """Say whether a subject may write anything at all of what a path pattern covers."""
         if subject == "" or subject in self.operators:

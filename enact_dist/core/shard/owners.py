@@ -63,17 +63,18 @@ ITEMS_WAITING_MAX: Final = 65_536
 """Requests in the locks of one identity that wait."""
 TOLD_MAX: Final = 1_000
 """So many identities the log names, each once, until the shard starts again."""
-_SHARD: Final = "shard."
+SHARD_PREFIX: Final = "shard."
+"""So begins the identity of a shard, and the name of its key."""
 
 
 def shard_identity(shard: str) -> str:
     """Return the identity under which a shard calls the others."""
-    return _SHARD + shard
+    return SHARD_PREFIX + shard
 
 
 def is_shard(identity: str) -> bool:
     """Whether an identity is that of a shard; that of a client names its host, too."""
-    return identity.startswith(_SHARD) and "@" not in identity
+    return identity.startswith(SHARD_PREFIX) and "@" not in identity
 
 
 def _session_getter(kind: type) -> Callable[[object], str] | None:

@@ -95,8 +95,8 @@ def access_rules(
     see = ["declare_liveliness_subscriber", "liveliness_query"]
     rules.add("see", "egress", see, [tokens], members)
     subjects: list[dict[str, object]] = [{"id": ALL_PEERS}]
-    for name, common_name in (names or {}).items():
-        subjects.append({"id": name, "cert_common_names": [common_name]})
+    for name, proof in (names or {}).items():
+        subjects.append({"id": name, "cert_common_names": [proof]})
     for name in map(shard_identity, shards if names is not None else ()):
         asks = [f"{requests}{verb}/{name}" for verb in _OF_SHARDS]
         rules.add(f"between shards {name}", "ingress", ["query"], asks, [name])

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.messages import Welcome
+from enact_dist.core.shard.owners import SHARD_PREFIX
 from enact_dist.errors import PermissionDeniedError, ShardUnreachableError
 from enact_dist.link.refusals import error_for
 from enact_dist.link.zenoh.access import barred
@@ -25,7 +26,7 @@ from enact_dist.link.zenoh.queries import (
     send_query,
     wait_connected,
 )
-from enact_dist.link.zenoh.tls import SHARD_PREFIX, refusals, why_refused
+from enact_dist.link.zenoh.tls import refusals, why_refused
 from enact_dist.wire.keys import ANY, NAMELESS, identity_of, parse_request_key, request_key, verb_of
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from enact_dist.core.shard.owners import shard_identity
+from enact_dist.core.shard.owners import SHARD_PREFIX, shard_identity
 from enact_dist.errors import ConfigError
 from enact_dist.link.zenoh.access import split_common_name
 from enact_dist.link.zenoh.endpoints import split_endpoint
@@ -36,7 +36,6 @@ KEYS_VARIABLE: Final = "ENACT_KEYS"
 IDENTITY_VARIABLE: Final = "ENACT_IDENTITY"
 AUTHORITY: Final = "ca.pem"
 AUTHORITY_KEY: Final = "ca.key"
-SHARD_PREFIX: Final = shard_identity("")
 DAY_S: Final = 86_400.0
 RENEW_DAYS: Final = 30.0
 """A certificate that ends within this time should be renewed."""
