@@ -30,6 +30,7 @@ from enact_dist.core.protocol.datum import Slot
 from enact_dist.core.protocol.messages import (
     Acquire,
     Break,
+    Commit,
     DropWorld,
     Explain,
     FindEffects,
@@ -110,6 +111,8 @@ class Guard:
             worlds: The world contexts that exist.
         """
         kind = type(message)
+        if kind is Commit:
+            return None  # compared behind its fence
         if isinstance(message, Acquire | TakeView):
             return self.refusal_of(message.items)
         if isinstance(message, Register):
