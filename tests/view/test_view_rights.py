@@ -5,12 +5,7 @@ import pytest
 pytest.importorskip("cryptography", reason="making keys needs the extra 'keys'")
 pytest.importorskip("viser", reason="pages need the extra 'view'")
 
-import sys
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "link"))
-
-import key_cells
+from rights_cells import guarded_cell
 from view_samples import until
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
@@ -22,21 +17,12 @@ from enact_dist.view.source import CellSource
 
 pytestmark = pytest.mark.carrier("zenoh")
 
-RIGHTS = """
-[rights]
-default = "none"
-programs = ["reader", "blind"]
-observe = ["reader"]
-[[rights.allow]]
-who = "reader"
-read = "online:open/**"
-"""
 SLOTS = [Slot("online", name, "count") for name in ("open/x", "secret/x", "secret/y")]
 
 
 @pytest.fixture
 def file(tmp_path):
-    cell = key_cells.KeyCell(tmp_path, more=RIGHTS)
+    cell = guarded_cell(tmp_path)
     with cell.running():
         yield cell.file
 

@@ -56,7 +56,7 @@ _log = logging.getLogger("enact.link")
 class Admission(Publisher, Protocol):
     """What a connection needs of the service that accepted it."""
 
-    def admit(self, connection: SocketConnection, session: str) -> None:
+    def admit(self, connection: SocketConnection, session: str, secret: str) -> None:
         """Admit a connection for a session; see `SocketService.admit`."""
 
     def left(self, connection: SocketConnection, session: str) -> None:
@@ -129,9 +129,9 @@ class SocketConnection:
             return False
         if kind != FrameKind.OPEN or payload:
             raise ProtocolError(f"a frame of kind {kind} came instead of a greeting")
-        session, self.identity = read_greeting(header)
+        session, self.identity, secret = read_greeting(header)
         try:
-            self._service.admit(self, session)
+            self._service.admit(self, session, secret)
             self.session = session
         except LinkError as error:
             self._refuse(error)

@@ -25,6 +25,7 @@ from enact_dist.errors import LinkError
 from enact_dist.link.socket.connection import SocketConnection
 from enact_dist.link.socket.frames import end_socket, prefixed
 from enact_dist.link.socket.peers import Deaths, PeerCredentials, check_peer
+from enact_dist.link.zenoh.access import opens
 from enact_dist.wire.frames import encode_frame
 from enact_dist.wire.keys import name_in
 
@@ -110,8 +111,8 @@ class SocketService:
                 self.host.count("connections_refused")
                 connected.close()
 
-    def admit(self, connection: SocketConnection, session: str) -> None:
-        """Admit a connection for a session.
+    def admit(self, connection: SocketConnection, session: str, secret: str) -> None:
+        """Admit a connection for a session, which its secret opens.
 
         Raises:
             LinkError: It is from another user, the session belongs to another process, or there are
@@ -124,6 +125,11 @@ class SocketService:
             raise LinkError(
                 f"process {peer.pid} of user {peer.user} called itself {asker}; shards call each"
                 " other over Zenoh"
+            )
+        if not opens(secret, session):
+            raise LinkError(
+                f"process {peer.pid} of user {peer.user} does not know the secret of session"
+                f" {session[:8]}; only the process that opened it does"
             )
         if owner and owner != asker:  # else the end of this process would end that session
             raise LinkError(not_yours(session, owner, asker).text)
