@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 from enact_dist.access.asking import answers_to, ask_all, expected
 from enact_dist.core.protocol.messages import (
     NO_LIMIT,
+    PERMISSION,
     Audited,
     ListAudit,
     ListLocks,
@@ -22,7 +23,6 @@ from enact_dist.core.protocol.messages import (
     Surveyed,
     Welcome,
 )
-from enact_dist.core.shard.owners import PERMISSION
 from enact_dist.core.state.retention import limits_of
 from enact_dist.errors import LinkError
 from enact_dist.link.refusals import error_of

@@ -15,14 +15,14 @@ from enact_dist.core.protocol.datum import Slot
 from enact_dist.view.feed import Feed
 from enact_dist.view.source import CellSource
 
-pytestmark = pytest.mark.carrier("zenoh")
+pytestmark = pytest.mark.carrier("auto")
 
 SLOTS = [Slot("online", name, "count") for name in ("open/x", "secret/x", "secret/y")]
 
 
 @pytest.fixture
-def file(tmp_path):
-    cell = guarded_cell(tmp_path)
+def file(tmp_path, request):
+    cell = guarded_cell(tmp_path, carrier=getattr(request, "param", "zenoh"))
     with cell.running():
         yield cell.file
 
@@ -54,6 +54,20 @@ def test_what_is_not_readable_is_named_beside_the_rest(file, monkeypatch):
             found = source.data_at(SLOTS, feed.catalogue.newest_ns)
             assert set(found.data) == {SLOTS[0]}
             assert sorted(slot for slot, _ in found.denied) == SLOTS[1:]
+
+
+@pytest.mark.parametrize("file", ["zenoh", "socket"], indirect=True)
+def test_history_of_what_is_not_readable_takes_no_other_with_it(file, monkeypatch):
+    """Neither one slot alone, which its shard refuses, nor one among several."""
+    with connect(file, actor="ada") as ada:
+        put(ada, 1)
+        monkeypatch.setenv("ENACT_IDENTITY", "reader")
+        with connect(file, actor="view", observer=True) as cell:
+            source = CellSource(cell)
+            alone = Slot("online", "secret/x", "unknown")
+            assert source.histories([SLOTS[1]]) == {}
+            assert source.histories([*SLOTS, alone]).keys() == {SLOTS[0]}
+            assert source.histories([SLOTS[0], alone]).keys() == {SLOTS[0]}
 
 
 def test_without_the_right_to_observe_it_ends(file, capsys, monkeypatch):

@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 from enact_dist.core.protocol.datum import Slot
 from enact_dist.core.protocol.messages import (
+    PERMISSION,
     Acquire,
     Break,
     DropWorld,
@@ -48,7 +49,7 @@ from enact_dist.core.protocol.messages import (
     TakeView,
 )
 from enact_dist.core.protocol.records import Story
-from enact_dist.core.rights.rules import ALL, DENIED, UNPROVEN, WRITE, path_of
+from enact_dist.core.rights.rules import ALL, UNPROVEN, WRITE, path_of
 from enact_dist.terms import ACCESSES
 
 if TYPE_CHECKING:
@@ -207,7 +208,7 @@ class Guard:
                 self._told.clear()
             self._told[key] = now_ns, 0
             more = f"; {left_out} more since the last line" if left_out else ""
-            asker = f" (asked by {self.asker})" if refused.code == DENIED and self.asker else ""
+            asker = f" (asked by {self.asker})" if refused.code == PERMISSION and self.asker else ""
             yield Story("permission.denied", f"{refused.text}{asker}{more}")
         self.denials.clear()
 

@@ -13,6 +13,7 @@ import threading
 from typing import TYPE_CHECKING, Final, Protocol
 
 from enact_dist.core.protocol.messages import (
+    PERMISSION,
     Answer,
     Hello,
     Outcome,
@@ -22,7 +23,7 @@ from enact_dist.core.protocol.messages import (
     Survey,
 )
 from enact_dist.core.rights.rules import UNPROVEN, path_of
-from enact_dist.core.shard.owners import PERMISSION, SESSION_OF, not_yours
+from enact_dist.core.shard.owners import SESSION_OF, not_yours
 from enact_dist.errors import LinkError, PermissionDeniedError, ProtocolError
 from enact_dist.link.answers import encoded, size_of
 from enact_dist.link.notices import Interest
