@@ -156,6 +156,7 @@ def test_a_reload_changes_whose_rights_a_connection_uses(tmp_path, monkeypatch):
         assert subjects == {"@cams"}
         take(None)
         assert present.ended.wait(5.0)
+        assert shard.host.figures()["sessions_barred"] == 1
         with pytest.raises(LinkError, match="has no rights at shard s"):
             connect(file, actor="camera", timeout_s=0.2)
 

@@ -19,7 +19,7 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.protocol.records import SessionDied
+from enact_dist.core.protocol.records import SessionBarred, SessionDied
 from enact_dist.core.shard.owners import is_shard, not_yours
 from enact_dist.errors import LinkError
 from enact_dist.link.socket.connection import SocketConnection
@@ -154,7 +154,7 @@ class SocketService:
         self._deaths.connected(session, connection.connected)
 
     def take_rights(self) -> None:
-        """Let each connection use the rights that the shard has now, or end it."""
+        """Let each connection use the rights that the shard has now, or end it and its session."""
         with self._mutex:
             present = [one for mine in self._connections.values() for one in mine]
         for connection in present:
@@ -162,6 +162,7 @@ class SocketService:
                 connection.subject = self._subject_of(connection.identity, connection.peer)
             except LinkError as error:
                 _log.warning("connection of %s ended: %s", connection.identity, error)
+                self.host.event(SessionBarred(connection.session))
                 connection.end()
 
     def _subject_of(self, identity: str, peer: PeerCredentials) -> str | None:
