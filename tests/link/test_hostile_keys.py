@@ -21,7 +21,7 @@ from enact_dist.core.protocol import messages as m
 from enact_dist.errors import ConfigError, EnactError, PermissionDeniedError
 from enact_dist.link.host import ShardHost
 from enact_dist.link.zenoh.access import session_of
-from enact_dist.link.zenoh.tls import KeyFiles
+from enact_dist.link.zenoh.tls import KeyFiles, own_certificate, why_refused
 from enact_dist.verify.floods.raw import RawZenoh
 from enact_dist.wire.frames import encode_frame
 from enact_dist.wire.keys import identity_of, quoted_identity, request_key
@@ -34,16 +34,16 @@ ODD_NAMES = ["ada/x", "ada@vm:1", "@vision", "*", "**", "ada~", "ada\nben", "x" 
 both = pytest.mark.parametrize("way", ["zenoh", "socket"])
 
 
-def certificate_of(cell, name):
-    """Return files with a certificate of the cell's authority for a name that no file may have."""
+def certificate_of(cell, name, use=ExtendedKeyUsageOID.CLIENT_AUTH):
+    """Return files with a certificate of the cell's authority that the commands do not make."""
     key = ec.generate_private_key(ec.SECP256R1())
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name, _validate=False)])
     now, day = dt.datetime.now(dt.UTC), dt.timedelta(days=1)
     draft = x509.CertificateBuilder(cell.authority.certificate.subject, subject, key.public_key())
     draft = draft.serial_number(x509.random_serial_number())
     draft = draft.not_valid_before(now - day).not_valid_after(now + day)
-    client = x509.ExtendedKeyUsage([ExtendedKeyUsageOID.CLIENT_AUTH])
-    signed = draft.add_extension(client, critical=False).sign(cell.authority.key, hashes.SHA256())
+    draft = draft.add_extension(x509.ExtendedKeyUsage([use]), critical=False)
+    signed = draft.sign(cell.authority.key, hashes.SHA256())
     files = KeyFiles(cell.keys, "odd")
     files.certificate.write_bytes(signed.public_bytes(serialization.Encoding.PEM))
     files.private_key.touch(0o600)
@@ -88,14 +88,23 @@ def test_certificate_of_an_odd_name_lets_ask_who_is_there_and_no_more(tmp_path, 
             assert raw.ask("left", hello, actor=identity, timeout_s=0.3) is None, identity
         assert submitted == []
         with pytest.raises(ConfigError, match="proves the name"):
-            cell_keys_of(cell, files)
+            own_certificate(files)
 
 
-def cell_keys_of(cell, files):
-    """Start as the library does with a key of that file's name."""
-    from enact_dist.link.zenoh.tls import own_certificate
-
-    return own_certificate(files)
+def test_certificate_of_a_server_opens_no_connection_of_a_client(tmp_path):
+    """Of the right name and authority, but for another use; the look says why in half a second."""
+    cell = key_cells.KeyCell(tmp_path)
+    files = certificate_of(cell, "odd", ExtendedKeyUsageOID.SERVER_AUTH)
+    with cell.running():
+        assert why_refused([cell.shards["left"]], cell.files("ada"), "left") == ""
+        refused_here = why_refused([cell.shards["left"]], files, "left")
+        assert "unsuitable certificate purpose" in refused_here
+        with (
+            RawZenoh(cell.config, keys=files) as raw,
+            RawZenoh(cell.config, keys=cell.files("ben")) as ben,
+        ):
+            ben.welcome("left", session_of("ben"), identity=BEN, actor="ben")
+            assert not raw.session.info.peers_zid()
 
 
 @pytest.mark.parametrize("name", ["a/b", "ada@host", "x" * 61, "x" * 201, "@vision", "*"])
