@@ -302,7 +302,7 @@ print(decode_frame(header, payload).code, flush=True)
 
 
 @pytest.mark.carrier("socket")
-@pytest.mark.parametrize("carry", ["socket"], indirect=True)
+@both
 def test_process_that_takes_anothers_name_releases_none_of_its_locks(
     daemon, carry, make_peer, endpoint, program
 ):

@@ -63,8 +63,8 @@ class Admission(Publisher, Protocol):
     def left(self, connection: SocketConnection, session: str) -> None:
         """Record the end of an admitted connection."""
 
-    def is_of_another_process(self, session: str, peer: PeerCredentials) -> bool:
-        """Whether a session has connections from a process other than this one."""
+    def may_release(self, session: str, peer: PeerCredentials) -> bool:
+        """Whether a session has connections from this process, or has ended."""
 
 
 class SocketConnection:
@@ -205,7 +205,7 @@ class SocketConnection:
         everything else by identity.
         """
         if type(message) is Release:
-            return not self._service.is_of_another_process(session, self.peer)
+            return self._service.may_release(session, self.peer)
         return type(message) is Outcome
 
     def _take(self, answer: Answer) -> None:

@@ -207,10 +207,12 @@ class SocketService:
             return f"{CONNECTIONS_MAX} connections to shard {self.host.name} are open"
         return ""
 
-    def is_of_another_process(self, session: str, peer: PeerCredentials) -> bool:
-        """Whether a session has connections from a process other than this one."""
+    def may_release(self, session: str, peer: PeerCredentials) -> bool:
+        """Whether a session has connections from this process, or has ended."""
         with self._mutex:
-            return any(one.peer != peer for one in self._connections.get(session, ()))
+            if any(one.peer == peer for one in self._connections.get(session, ())):
+                return True
+        return session not in self.host.owners()
 
     def _has_its_share(self, peer: PeerCredentials) -> bool:
         """Whether a process must leave the free connections to others."""
