@@ -238,7 +238,7 @@ class ShardHost:
         file = message.file
         answer: Answer | None = self._refusal(message, identity)
         if answer is None and message.session not in self._shard.state.sessions.by_id:
-            # Drafts end with their session; the name of one that nobody has takes no place.
+            # Drafts end with their session; the name of an unknown one takes no place.
             answer = EpochChanged(self.epoch) if message.total else Staged(file, 0, shared=False)
         if answer is None and self.rights is not None:
             with self._mutex:

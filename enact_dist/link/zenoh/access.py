@@ -145,7 +145,7 @@ def actor_said(name: str, actor: str) -> str:
 def session_of(name: str, secret: str = "") -> str:
     """Return a new id for a session of a name.
 
-    Its first part is the hash of `secret` (default: one that nobody keeps), which opens a shard's
+    Its first part is the hash of `secret` (default: one that is not kept), which opens a shard's
     socket for the session (`opens`).
     """
     return _hash_of(secret or secrets.token_hex(16)) + _mark_of(name)
