@@ -37,6 +37,7 @@ from enact_dist.core.protocol.messages import (
     Prepare,
     Refused,
     Stage,
+    Staged,
 )
 from enact_dist.core.protocol.records import (
     Compare,
@@ -234,13 +235,15 @@ class ShardHost:
     ) -> None:
         if self._ended:
             return
-        refusal = self._refusal(message, identity)
-        if message.total and message.session not in self._shard.state.sessions.by_id:
-            refusal = refusal or EpochChanged(self.epoch)
-        if refusal is None and self.rights is not None:
+        file = message.file
+        answer: Answer | None = self._refusal(message, identity)
+        if answer is None and message.session not in self._shard.state.sessions.by_id:
+            # Drafts end with their session; the name of an unknown one takes no place.
+            answer = EpochChanged(self.epoch) if message.total else Staged(file, 0, shared=False)
+        if answer is None and self.rights is not None:
             with self._mutex:
-                refusal = self._shard.denied(message, identity, subject)
-        reply(refusal or self._payloads.stage(message, identity))
+                answer = self._shard.denied(message, identity, subject)
+        reply(answer or self._payloads.stage(message, identity))
 
     def _refusal(self, message: Request, identity: str) -> Refused | EpochChanged | None:
         """Return why the shard will refuse a message because of its sender, else None."""

@@ -6,10 +6,18 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeVar
 
-from enact_dist.access.asking import answers_to, explained, in_parts
+from enact_dist.access.asking import expected, explained, in_parts
 from enact_dist.access.snapshot import HeldView
 from enact_dist.core.protocol.datum import Slot
-from enact_dist.core.protocol.messages import Item, ListHistory, Ping, SlotVersion, Versions
+from enact_dist.core.protocol.messages import (
+    PERMISSION,
+    Item,
+    ListHistory,
+    Ping,
+    Refused,
+    SlotVersion,
+    Versions,
+)
 from enact_dist.errors import (
     ForgottenError,
     LeaseLostError,
@@ -221,7 +229,10 @@ class CellSource:
             return found
 
     def histories(self, slots: Sequence[Slot]) -> Histories:
-        """Return which versions of these slots the shards that answer still know."""
+        """Return which versions of these slots the shards that answer still know.
+
+        Slots that this program may not read are left out; `data_at` names them.
+        """
         return self._of_those_there(slots, self._histories)
 
     def _histories(self, slots: Sequence[Slot]) -> Histories:
@@ -237,8 +248,10 @@ class CellSource:
             for entities in in_parts(each)
         ]
         found: Histories = {}
-        for _, answer in answers_to(client, Versions, calls):
-            for entry in answer.entries:
+        for answer in client.call_all(calls):
+            if isinstance(answer, Refused) and answer.code == PERMISSION:
+                continue  # asked about one slot alone; of several the shard leaves such ones out
+            for entry in expected(Versions, ListHistory, answer).entries:
                 state = entry.state
                 if state.slot in wanted and state.version:
                     found.setdefault(state.slot, []).append((state.version, state.stamp_ns))

@@ -133,7 +133,7 @@ def test_this_process_and_operators_need_no_right():
 
 
 def test_a_name_without_proof_may_do_nothing_and_may_try_again():
-    """It may say hello, renew and leave; its refusal does not end an actor for good."""
+    """It may say hello and renew; its refusal does not end an actor for good."""
     bench = GuardedBench(read="online:**")
     handle = type(bench.shard).handle
     asked = handle(

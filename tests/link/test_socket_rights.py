@@ -11,12 +11,16 @@ from ports import free_endpoint
 
 from enact_dist import Aspect, Durability, Entities, Entity, Lock, View, Write, connect
 from enact_dist.config.read import load_config
+from enact_dist.core.protocol import messages as m
+from enact_dist.core.protocol.datum import LockId
 from enact_dist.core.rights.rules import Rights
 from enact_dist.errors import LinkError, PermissionDeniedError
 from enact_dist.link.daemon.daemon import start_shard
 from enact_dist.link.daemon.settings import DaemonSettings
 from enact_dist.link.socket import service
 from enact_dist.link.socket.peers import PeerCredentials, peer_of
+from enact_dist.verify.floods.raw import RawZenoh
+from enact_dist.wire.limits import INTEGER_MAX
 
 pytestmark = pytest.mark.carrier("auto")
 
@@ -105,6 +109,25 @@ def test_a_name_over_zenoh_is_no_proof(tmp_path, monkeypatch):
             put(ada, "view/1", 1)
 
 
+def test_a_name_over_zenoh_ends_nothing_of_that_name(tmp_path):
+    """Whoever takes the name of a client, and the id of its session, from a listing."""
+    with guarded(tmp_path) as (shard, file), connect(file, actor="camera") as camera:
+        request = Write(camera.world("online"), Entity("view/1"), COUNT)
+        with RawZenoh(load_config(file, environment={})) as raw, Lock(request) as lock:
+            (session,), (identity,) = zip(*shard.host.owners().items(), strict=True)
+            epoch, held = shard.host.epoch, LockId(session, 0, 1)
+            views = tuple(m.LaneView(lane, INTEGER_MAX) for lane in range(4))
+            for message in (m.Release(held), m.Goodbye(session)):
+                answer = raw.ask("s", message, actor=identity)
+                assert answer.code == "unproven"
+                assert "asked to end sessions and locks over Zenoh" in answer.text
+            renewed = raw.ask("s", m.KeepAlive(session, epoch, 1, views, b""), actor=identity)
+            assert isinstance(renewed, m.Alive)
+            assert [one.lock.session for one in renewed.grants] == [session]
+            lock[request] = 1
+        assert shard.host.figures().get("orphans_freed", 0) == 0
+
+
 def test_a_watch_over_the_socket_leaves_out_what_is_not_readable(tmp_path):
     """Also where a commit changes both; the numbers of its notices have no gap."""
     with (
@@ -156,6 +179,7 @@ def test_a_reload_changes_whose_rights_a_connection_uses(tmp_path, monkeypatch):
         assert subjects == {"@cams"}
         take(None)
         assert present.ended.wait(5.0)
+        assert shard.host.figures()["sessions_barred"] == 1
         with pytest.raises(LinkError, match="has no rights at shard s"):
             connect(file, actor="camera", timeout_s=0.2)
 

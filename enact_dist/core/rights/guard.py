@@ -17,9 +17,10 @@ request                                  right
 =======================================  =======================================================
 
 A question about one slot alone is refused without `read` of it: it would look like null otherwise.
-Everything else needs none: the owner of a session may renew, release and end, and shards are known
-by their own identity (`enact_dist.core.shard.owners`).  Locks are refused before they get a place
-in the queue.  A commit is compared again behind its fence, since a client may send anything.
+Everything else needs none: the owner of a session may renew it, and release and end if the
+transport vouches for its name; shards are known by their own identity
+(`enact_dist.core.shard.owners`).  Locks are refused before they get a place in the queue.  A commit
+is compared again behind its fence, since a client may send anything.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 from enact_dist.core.protocol.datum import Slot
 from enact_dist.core.protocol.messages import (
+    PERMISSION,
     Acquire,
     Break,
     Commit,
@@ -36,6 +38,7 @@ from enact_dist.core.protocol.messages import (
     FindEffects,
     ForceAbort,
     Fork,
+    Goodbye,
     KeepVersions,
     ListAudit,
     ListHistory,
@@ -45,11 +48,12 @@ from enact_dist.core.protocol.messages import (
     RefusalEntry,
     Refused,
     Register,
+    Release,
     Stage,
     TakeView,
 )
 from enact_dist.core.protocol.records import Story
-from enact_dist.core.rights.rules import ALL, DENIED, UNPROVEN, WRITE, path_of
+from enact_dist.core.rights.rules import ALL, UNPROVEN, WRITE, path_of
 from enact_dist.terms import ACCESSES
 
 if TYPE_CHECKING:
@@ -68,6 +72,7 @@ NOTED_MAX: Final = 1_000
 _OBSERVING: Final = frozenset(
     (ListLocks, ListSessions, Explain, FindEffects, ListAudit, ListRefusals)
 )
+_ENDING: Final = frozenset((Goodbye, Release))
 
 
 class SlotContents(Protocol):
@@ -131,6 +136,8 @@ class Guard:
             return self.denied(WRITE, "anything")
         if kind in _OBSERVING and (refused := self._plain("observe", ALL, "the cell")) is not None:
             return refused
+        if kind in _ENDING and self.subject == UNPROVEN:
+            return self.denied("end", "sessions and locks")
         alone = _asked_alone(message)
         return self.may_not_read(alone) if alone is not None else None
 
@@ -210,7 +217,7 @@ class Guard:
                 self._told.clear()
             self._told[key] = now_ns, 0
             more = f"; {left_out} more since the last line" if left_out else ""
-            asker = f" (asked by {self.asker})" if refused.code == DENIED and self.asker else ""
+            asker = f" (asked by {self.asker})" if refused.code == PERMISSION and self.asker else ""
             yield Story("permission.denied", f"{refused.text}{asker}{more}")
         self.denials.clear()
 

@@ -35,6 +35,7 @@ from enact_dist.core.protocol.records import (
     Story,
     WorldRecord,
 )
+from enact_dist.core.rights.rules import UNPROVEN
 from enact_dist.core.shard import owners
 from enact_dist.core.shard.inspection import REPORT_BYTES_MAX
 from enact_dist.terms import Durability
@@ -209,7 +210,9 @@ class SessionDesk:
         session.renew(self._state.now_ns, message.count)
         if message.report:  # kept for listings, which leave longer ones out
             session.report = message.report if len(message.report) <= REPORT_BYTES_MAX else b""
-        lowest = {view.lane: view.seq for view in message.view}
+        guard = self._state.guard
+        proven = guard is None or guard.subject != UNPROVEN  # what ends locks has to be
+        lowest = {view.lane: view.seq for view in message.view if proven}
         for tenure in self._state.tenures.of_session(message.session):
             unwanted = tenure.lock.seq < lowest.get(tenure.lock.lane, 0)
             if unwanted and not (tenure.bound or tenure.kept):

@@ -74,7 +74,7 @@ _log = logging.getLogger("enact.shard")
 class RunningShard:
     """A running shard.  Made by `start_shard`; `stop` it before the interpreter exits."""
 
-    def __init__(self, settings: DaemonSettings) -> None:
+    def __init__(self, settings: DaemonSettings, certificate: Certificate | None) -> None:
         self.settings = settings
         self._ended = threading.Event()
         self._stopping = threading.Lock()
@@ -125,7 +125,7 @@ class RunningShard:
             undo.callback(self._service.close)
             self.reload: Reload | None = None
             if settings.keys is not None or settings.shard.rights is not None:
-                self.reload = Reload(self._take_again, self.host.count, settings.keys)
+                self.reload = Reload(self._take_again, self.host.count, settings.keys, certificate)
             undo.pop_all()
 
     def _open_session(self) -> zenoh.Session:
@@ -313,10 +313,10 @@ def start_shard(settings: DaemonSettings) -> RunningShard:
     """
     if not settings.listen:
         raise ConfigError(f"shard {settings.shard.name} has no endpoint to listen at")
-    if settings.keys is not None:
-        checked_keys(settings.keys, settings.hosts)
+    keys = settings.keys
+    certificate = checked_keys(keys, settings.hosts) if keys is not None else None
     refuse_second_daemon(settings)
-    return RunningShard(settings)
+    return RunningShard(settings, certificate)
 
 
 def refuse_second_daemon(settings: DaemonSettings, *, probe_s: float | None = None) -> None:
