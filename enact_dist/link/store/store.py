@@ -50,6 +50,7 @@ if TYPE_CHECKING:
 
     from enact_dist.core.protocol.records import Persist
     from enact_dist.link.folder.blobs import Blob
+    from enact_dist.link.store.media import Medium
     from enact_dist.link.store.recovery import Contents
 
 FOLDER_MODE: Final = 0o700
@@ -122,7 +123,7 @@ class Store:
         batch: Number of the newest batch.
     """
 
-    def __init__(self, medium: FolderMedium, contents: Contents, *, wall_ns: int) -> None:
+    def __init__(self, medium: Medium, contents: Contents, *, wall_ns: int) -> None:
         self._medium = medium
         self._ids = contents.ids
         self._states = contents.states
