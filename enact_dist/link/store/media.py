@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from enact_dist.link.folder.blobs import Blob, Mapped
+    from enact_dist.link.lease import Holding
     from enact_dist.link.store.database import DatabaseRow
 
 
@@ -57,6 +58,10 @@ class Medium(Protocol):
     @property
     def name(self) -> str:
         """Where it is, for messages."""
+
+    @property
+    def holding(self) -> Holding | None:
+        """For how long this process holds the shard; None: until `close`."""
 
     @property
     def bodies(self) -> Bodies:

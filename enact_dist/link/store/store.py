@@ -121,10 +121,12 @@ class Store:
 
     Attributes:
         batch: Number of the newest batch.
+        holding: For how long this process holds the shard; None: until `close`.
     """
 
     def __init__(self, medium: Medium, contents: Contents, *, wall_ns: int) -> None:
         self._medium = medium
+        self.holding = medium.holding
         self._ids = contents.ids
         self._states = contents.states
         locks = (outcome.lock for outcome in contents.recovered.outcomes)
