@@ -71,7 +71,7 @@ class Lease:
 
     def confirmed(self, sent_s: float) -> None:
         """Take note that a write which was sent at `sent_s` is confirmed."""
-        # Two threads may confirm at once: the lesser time does harm to nobody.
+        # Two threads may do this at once: the lesser time does no harm.
         self.held_until_s = max(self.held_until_s, sent_s + self.usable_s)
 
 

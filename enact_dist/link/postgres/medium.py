@@ -151,16 +151,23 @@ def database_errors(name: str) -> Iterator[None]:
     try:
         yield
     except psycopg.Error as failure:
-        found = " ".join(str(failure).split()) or type(failure).__name__
+        found = in_one_line(failure)
         code = f" (SQLSTATE {failure.sqlstate})" if failure.sqlstate else ""
         raise StoreError(
-            f"{name}: the database reports {found}{code}: {_remedy(failure)}; all acknowledged"
+            f"{name}: the database reports {found}{code}: {remedy_of(failure)}; all acknowledged"
             " data are kept",
             path=name,
         ) from failure
 
 
-def _remedy(failure: psycopg.Error) -> str:
+def in_one_line(failure: psycopg.Error) -> str:
+    """Return what an error says, without line breaks and a question at its end."""
+    text = " ".join(str(failure).split()) or type(failure).__name__
+    return text.replace(" Is the server running on that host and accepting TCP/IP connections?", "")
+
+
+def remedy_of(failure: psycopg.Error) -> str:
+    """Return what an operator can do about an error."""
     kind, text = (failure.sqlstate or "")[:2], str(failure)
     if kind == "28" or "password" in text or "role " in text:
         return "correct the user or password in ENACT_STORE, ~/.pgpass or pg_hba.conf"

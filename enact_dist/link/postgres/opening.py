@@ -38,15 +38,15 @@ def connector_of(address: StoreAddress) -> Connector:
     return Connector(address.url, f"enact {address.cell} {address.shard} on {myself()}")
 
 
-def look(session: DatabaseSession, address: StoreAddress) -> SeenRow:
-    """Return who holds a shard; make its row and the tables if they are missing.
+def look(session: DatabaseSession, address: StoreAddress) -> tuple[int, SeenRow]:
+    """Return a shard's row and who holds it; make the row and the tables if they are missing.
 
     Raises:
         StoreError: The tables are of another format.
         psycopg.Error: As the database reports it.
     """
     make_tables(session, address.cell, address.shard)
-    return _row(session, address)[1]
+    return _row(session, address)[:2]
 
 
 def _row(

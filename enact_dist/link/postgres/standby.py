@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.link.lease import DRIFT
 from enact_dist.link.postgres.address import FreeShard, SeenRow, ShardHeldError
-from enact_dist.link.postgres.connection import LOST
-from enact_dist.link.postgres.medium import database_errors
+from enact_dist.link.postgres.connection import LOST, myself
+from enact_dist.link.postgres.medium import database_errors, in_one_line
 from enact_dist.link.postgres.opening import connector_of, look
+from enact_dist.link.postgres.tables import NAME_ME, name_of_standby
 
 if TYPE_CHECKING:
     import threading
@@ -82,13 +83,16 @@ def wait_free(
     connector = connector_of(address)
     watch = BeatWatch(address.lease_s)
     session: DatabaseSession | None = None
-    noted = ""
+    noted, told = "", False
     try:
         while not stopped.is_set():
             try:
                 if session is None:
-                    session = connector.connect()
-                seen = look(session, address)
+                    session, told = connector.connect(), False
+                shard, seen = look(session, address)
+                if not told and seen.holder:
+                    told = True
+                    session.row(NAME_ME, (name_of_standby(shard, myself()),))
                 if watch.is_free(seen, time.monotonic()):
                     return FreeShard(address, seen)
                 found = f"{address} is served by process {seen.holder}"
@@ -106,7 +110,7 @@ def wait_free(
                     session.close()
                     session = None
                 watch.reconnected()
-                found = f"{address} cannot be reached: {' '.join(str(failure).split())}"
+                found = f"{address} cannot be reached: {in_one_line(failure)}"
             if found != noted:
                 note(found)
                 noted = found

@@ -80,6 +80,17 @@ BODIES: Final = "SELECT name, data FROM enact.body WHERE shard = %b ORDER BY nam
 COPIES: Final = """
 SELECT application_name, sync_state, state FROM pg_stat_replication ORDER BY application_name
 """
+SHARDS: Final = "SELECT id, name, epoch, batch, holder FROM enact.shard WHERE cell = %s"
+NAME_ME: Final = "SELECT set_config('application_name', %s, false)"
+STANDBYS: Final = """
+SELECT application_name FROM pg_stat_activity WHERE application_name LIKE 'enact-standby/%/%'
+ORDER BY backend_start
+"""
+
+
+def name_of_standby(shard: int, who: str) -> str:
+    """Return the name under which a standby's connection stands in `STANDBYS`."""
+    return f"enact-standby/{shard}/{who}"
 
 
 def state_of_shard(cell: str, shard: str) -> tuple[str, tuple[str, str]]:
