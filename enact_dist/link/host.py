@@ -56,7 +56,7 @@ from enact_dist.core.state.clock import state_of
 from enact_dist.errors import StoreError
 from enact_dist.link.clock import Clock, SystemClock
 from enact_dist.link.host_figures import Stalls, figures_of, latencies_of
-from enact_dist.link.lease import Silence
+from enact_dist.link.lease import AnswerGate
 from enact_dist.link.memory.payload_desk import PayloadDesk, half_of, names_payloads
 from enact_dist.link.memory.use_marks import mark_uses
 from enact_dist.link.signals import Uninterrupted
@@ -141,7 +141,7 @@ class ShardHost:
         if store is None:
             shard.keep_nothing()
         self._store_thread = self._start_store(store) if store is not None else None
-        self.silence = Silence.of(store, self.count, self._fail)
+        self.silence = AnswerGate.of(store, self.count, self._fail)
         self._stalls = Stalls(self.name, self.count)
         self._timer = threading.Thread(target=self._keep_time, name="enact-timer", daemon=True)
         self._timer.start()

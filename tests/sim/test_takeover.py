@@ -81,8 +81,8 @@ def sends_again_unasked(patch):
             return None
         return daemons.RowChange(row._replace(batch=row.batch + 1, beat=row.beat + 1), batch)
 
-    def after_break(row, *, epoch, batch):
-        return lease.BrokenBatch.MISSING if row.epoch == epoch else lease.BrokenBatch.TAKEN
+    def after_break(found, *, epoch, batch):
+        return lease.BrokenBatch.MISSING if found[0] == epoch else lease.BrokenBatch.TAKEN
 
     patch(SimulatedDaemon, "putting", putting)
     patch(daemons, "after_break", after_break)
@@ -192,7 +192,7 @@ def test_a_failover_of_the_database_costs_no_takeover(seed):
 
 
 def test_a_standby_that_counts_over_an_outage_takes_the_shard(monkeypatch):
-    monkeypatch.setattr(lease.Standby, "connected", lambda _self: None)
+    monkeypatch.setattr(lease.Standby, "was_away", lambda _self: None)
 
     taken = [
         _OneFailover(seed).run().tally["epoch changes"] > len(_OneFailover(seed).pairs)

@@ -106,6 +106,11 @@ def kept_ns(lease_ns: int) -> int:
     return lease_ns - lease_ns * DRIFT_PPM // 1_000_000
 
 
+def waited_ns(lease_ns: int) -> int:
+    """Return how long a standby waits for the end of a lease."""
+    return lease_ns + lease_ns * DRIFT_PPM // 1_000_000
+
+
 class BrokenBatch(enum.Enum):
     """What became of a batch whose connection broke."""
 
@@ -117,44 +122,42 @@ class BrokenBatch(enum.Enum):
     """Another process has the shard: end, and write nothing."""
 
 
-def after_break(row: ShardRow, *, epoch: int, batch: int) -> BrokenBatch:
-    """Say what became of a batch, by the row that a new connection shows."""
-    if row.epoch == epoch and row.batch == batch:
+def after_break(found: tuple[int, int], *, epoch: int, batch: int) -> BrokenBatch:
+    """Say what became of a batch, by the epoch and batch that a new connection shows."""
+    if found == (epoch, batch):
         return BrokenBatch.STANDS
-    if row.epoch == epoch and row.batch == batch - 1:
-        return BrokenBatch.MISSING
-    return BrokenBatch.TAKEN
+    return BrokenBatch.MISSING if found == (epoch, batch - 1) else BrokenBatch.TAKEN
 
 
 class Standby:
-    """Decides when a daemon that stands by takes its shard over.
+    """Decides by what is seen of a shard's row whether a standby may take the shard.
 
     Args:
-        lease_ns: The lease of the cell.
+        lease_ns: The lease of its holder.
+
+    Attributes:
+        alive: Whether the holder was seen to write since the last outage.
     """
 
-    __slots__ = ("_connected_before", "_due_ns", "_lease_ns", "_more_ns", "_seen")
+    __slots__ = ("_lease_ns", "_seen", "_since_ns", "_wait_ns", "alive")
 
     def __init__(self, lease_ns: int) -> None:
         self._lease_ns = lease_ns
+        self._wait_ns = waited_ns(lease_ns)
         self._seen: tuple[int, int] | None = None
-        self._due_ns = self._more_ns = 0
-        self._connected_before = False
+        self._since_ns = 0
+        self.alive = False
 
-    def connected(self) -> None:
-        """Take note of a new connection: the time without one proves nothing about the holder."""
-        self._more_ns = OUTAGE_NS if self._connected_before else 0
-        self._connected_before = True
+    def was_away(self) -> None:
+        """Count anew, and longer until the holder is seen: the database did not answer."""
         self._seen = None
+        self._wait_ns = waited_ns(self._lease_ns + OUTAGE_NS)
 
-    def saw(self, row: ShardRow, now_ns: int) -> bool:
-        """Take note of the row; say whether to take the shard over, naming this row."""
-        if row.holder == "":
-            return True
-        if (row.epoch, row.beat) != self._seen:
-            if self._seen is not None:
-                self._more_ns = 0
-            self._seen = row.epoch, row.beat
-            waits_ns = self._lease_ns + self._lease_ns * DRIFT_PPM // 1_000_000 + self._more_ns
-            self._due_ns = now_ns + waits_ns
-        return now_ns >= self._due_ns
+    def is_free(self, row: ShardRow, now_ns: int) -> bool:
+        """Whether no process can answer for the shard, as of a look that ended at `now_ns`."""
+        if self._seen != (row.epoch, row.beat):
+            self.alive = self._seen is not None
+            if self.alive:
+                self._wait_ns = waited_ns(self._lease_ns)
+            self._seen, self._since_ns = (row.epoch, row.beat), now_ns
+        return not row.holder or now_ns - self._since_ns > self._wait_ns

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from enact_dist.core.shard.state import ShardSettings
     from enact_dist.verify.simulation.faults import Faults
     from enact_dist.verify.simulation.hosts.world import SimulatedWorld
-    from enact_dist.verify.takeover.database import Wire, SimulatedDatabase
+    from enact_dist.verify.takeover.database import SimulatedDatabase, Wire
 
 RENEW_NS = 400 * MS
 LOOK_NS = 100 * MS
@@ -71,6 +71,7 @@ class SimulatedLine:
         connection = self.connection()
         if connection is None:
             self._act = None
+            self.breaks += 1
             self._daemon.later(AGAIN_NS, again)
         else:
             self._act = again
@@ -117,7 +118,7 @@ class SimulatedDaemon(ShardNode):
         self._silence = Silence(self.lease)
         self._lines = SimulatedLine(self), SimulatedLine(self)
         self._standby = Standby(self.lease.lease_ns)
-        self._standby_breaks = -1
+        self._breaks = 0
         self._look()
 
     def _look(self) -> None:
@@ -125,13 +126,13 @@ class SimulatedDaemon(ShardNode):
         connection = line.attempt(self._look)
         if connection is None:
             return
-        if line.breaks != self._standby_breaks:
-            self._standby_breaks = line.breaks
-            self._standby.connected()
+        if line.breaks != self._breaks:
+            self._breaks = line.breaks
+            self._standby.was_away()
 
         def seen(row: ShardRow, _persists: tuple[Persist, ...]) -> None:
             line.done()
-            if self._standby.saw(row, self.local_ns):
+            if self._standby.is_free(row, self.local_ns):
                 self._take_over(row)
             else:
                 self.later(LOOK_NS, self._look)
@@ -235,7 +236,7 @@ class SimulatedDaemon(ShardNode):
         """Ask what became of a batch whose answer was lost."""
 
         def seen(row: ShardRow, _persists: tuple[Persist, ...]) -> None:
-            found = after_break(row, epoch=self._epoch, batch=self._batch)
+            found = after_break(row[:2], epoch=self._epoch, batch=self._batch)
             if found is BrokenBatch.TAKEN:
                 self.ends("another daemon took the shard")
             elif found is BrokenBatch.MISSING:
