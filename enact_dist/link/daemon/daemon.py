@@ -280,10 +280,10 @@ class RunningShard:
 
 
 def _metrics_server(settings: DaemonSettings, host: ShardHost) -> MetricsServer:
-    from enact_dist.link.daemon.metrics import MetricsServer, page
+    from enact_dist.link.daemon.metrics import MetricsServer, shown_of
 
     assert settings.metrics is not None
-    return MetricsServer(settings.metrics, lambda: page(host, settings.cell), host.count)
+    return MetricsServer(settings.metrics, shown_of(host, settings.cell))
 
 
 def _shared_folder(settings: DaemonSettings) -> SharedFolder | None:
