@@ -19,6 +19,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler
 from itertools import accumulate
@@ -69,7 +70,8 @@ class Pulse:
         return time.monotonic() < self._until_s
 
 
-class Shown(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Shown:
     """What a server of metrics shows; called from its threads.
 
     Attributes:
