@@ -175,10 +175,12 @@ def _refuse_second(config: CellConfig, shard: ShardConfig) -> None:
     """
     from enact_dist.link.zenoh.endpoints import somebody_listens
 
+    if config.store:
+        return  # the database lets one of them serve
     elsewhere = [endpoint for endpoint in shard.advertise if endpoint not in shard.listen]
     if not any(somebody_listens(endpoint) for endpoint in (*shard.listen, *elsewhere)):
         return
-    from enact_dist.link.daemon.daemon import refuse_second_daemon
+    from enact_dist.link.daemon.second_daemon import refuse_second_daemon
     from enact_dist.link.daemon.settings import DRAIN_S, DaemonSettings
     from enact_dist.link.zenoh.tls import shard_keys
     from enact_dist.operate.supervise import END_S

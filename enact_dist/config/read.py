@@ -118,6 +118,7 @@ def parse_config(
     config = _cell(root, file)
     config = with_environment(config, os.environ if environment is None else environment)
     _check_doors(root, config)
+    _check_store(root, config)
     check_clients(root, config)
     refuse_unproven_names(root, config)
     return config
@@ -191,6 +192,27 @@ def _check_doors(root: Table, config: CellConfig) -> None:
                     ' keys = "keys", or set ENACT_KEYS (docs/security.md explains how to make them)'
                 )
                 table.refuse(key if key in table.values else "listen", problem)
+
+
+def _check_store(root: Table, config: CellConfig) -> None:
+    """Refuse folders beside a database: a shard has its data in one of them.
+
+    Raises:
+        ConfigError: Both are given, in the file or by variables.
+    """
+    if not config.store:
+        return
+    tables = [("data_folder", root, config.data_folder)]
+    tables += [
+        ("folder", root.table("shards").table(one.name), one.folder) for one in config.shards
+    ]
+    for key, table, folder in tables:
+        if folder is not None:
+            table.refuse(
+                key,
+                f"{key} = {str(folder)!r} and a store in a database exclude each other (`store`,"
+                " ENACT_STORE or --store): remove one of them",
+            )
 
 
 def _check_actors(root: Table, config: CellConfig) -> None:

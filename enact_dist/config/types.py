@@ -44,9 +44,12 @@ TTL_S_MIN: Final = 0.2
 """Shorter leases end in ordinary scheduling pauses of a loaded machine."""
 TTL_S_MAX: Final = 60.0
 """A dead holder blocks its data for one TTL, a restarted shard waits one for absent sessions."""
+LEASE_S_MIN, LEASE_S_MAX = 0.5, 60.0
+"""A shorter lease ends while a host is busy; a standby waits for the whole of a longer one."""
 DRAIN_S_MAX: Final = 3600.0
 """Default duration of `enact lock hold`."""
 
+_STORE: Final = re.compile(r"postgres(?:ql)?://\S+\Z")
 _ENDPOINT: Final = re.compile(r"(?:tcp|tls)/(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):(\d{1,5})\Z")
 _ADDRESS: Final = re.compile(r"((\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)?:)?\d{1,5}\Z")
 _DOTTED_NAME: Final = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*\Z")
@@ -83,6 +86,20 @@ def metrics_address(text: str) -> tuple[str, int]:
     return host.strip("[]") or "127.0.0.1", int(port)
 
 
+def checked_store(url: str) -> str:
+    """Return `url` if it is the address of a PostgreSQL database.
+
+    Raises:
+        ValueError: It has another form.
+    """
+    if not _STORE.match(url):
+        raise ValueError(
+            f"{url!r} is no address of a database; write postgresql://user@host/database, with"
+            " several hosts as host1,host2"
+        )
+    return url
+
+
 def is_locked(endpoint: str) -> bool:
     """Return whether only programs with a key of the cell can connect to an endpoint."""
     return endpoint.startswith("tls/")
@@ -112,6 +129,8 @@ TTL_S_DEFAULT: Final = 2.0
 """Session TTL in seconds: a dead holder blocks others that long; shorter needs a quiet network."""
 
 CARRIER_DEFAULT: Final = "auto"
+
+LEASE_S_DEFAULT: Final = 2.0
 
 _EXAMPLE: Final = "tcp/127.0.0.1:7447"
 _DRAIN: Final = TableKey(high=DRAIN_S_MAX, variable="DRAIN_S")
@@ -262,6 +281,9 @@ class CellConfig:
         carrier: How messages travel between processes.
         shared_bytes_max: Cap of each shard's large data in shared memory, bytes.
         data_folder: Where shards without a `folder` of their own keep theirs, or ``None``.
+        store: Address of the database that keeps the data of all shards; empty: folders do.
+        lease_s: How long a shard may answer after the database's last confirmation, seconds; then
+            a standby takes over.
         security: The keys of the cell, and who has every right.
         worlds: World contexts that exist from the start.
         shards: At least one, in the order of the file.
@@ -279,6 +301,8 @@ class CellConfig:
     carrier: Annotated[str, TableKey(choices=CARRIERS, variable="CARRIER")] = CARRIER_DEFAULT
     shared_bytes_max: Annotated[int | None, TableKey(variable="SHARED_BYTES_MAX")] = None
     data_folder: Annotated[Path | None, TableKey(variable="DATA_FOLDER")] = None
+    store: Annotated[str, TableKey(make=checked_store, variable="STORE")] = ""
+    lease_s: Annotated[float, TableKey(low=LEASE_S_MIN, high=LEASE_S_MAX)] = LEASE_S_DEFAULT
     security: Annotated[SecurityConfig, TableKey(table=SecurityConfig, make=is_security)] = field(
         default_factory=SecurityConfig
     )

@@ -55,6 +55,7 @@ from enact_dist.core.state.clock import state_of
 from enact_dist.errors import StoreError
 from enact_dist.link.clock import Clock, SystemClock
 from enact_dist.link.host_figures import Stalls, figures_of, latencies_of
+from enact_dist.link.lease import Silence
 from enact_dist.link.memory.payload_desk import PayloadDesk, half_of, names_payloads
 from enact_dist.link.memory.use_marks import mark_uses
 from enact_dist.link.signals import Uninterrupted
@@ -139,6 +140,7 @@ class ShardHost:
         if store is None:
             shard.keep_nothing()
         self._store_thread = self._start_store(store) if store is not None else None
+        self._silence = Silence.of(store, self.count, self._fail)
         self._stalls = Stalls(self.name, self.count)
         self._timer = threading.Thread(target=self._keep_time, name="enact-timer", daemon=True)
         self._timer.start()
@@ -205,6 +207,9 @@ class ShardHost:
         kind = type(message)
         if kind is Commit or kind is Prepare:
             commit: Commit = message  # type: ignore[assignment]  # as just found
+            if self._silence and (too_large := self._silence.too_large(commit, self._shard.state)):
+                reply(too_large)
+                return
             if names_payloads(commit) and self._refusal(commit, identity) is None:
                 message = self._payloads.with_bodies(commit)  # otherwise staged data stay
         elif kind is Stage:
@@ -339,14 +344,15 @@ class ShardHost:
         clock = self._clock
         later: list[Publish | Story] = []
         try:
-            for effect in self._shard.handle(
+            effects = self._shard.handle(
                 message,
                 reply_to=handle,
                 identity=identity,
                 subject=subject,
                 now_ns=clock.monotonic_ns(),
                 wall_ns=clock.wall_ns(),
-            ):
+            )
+            for effect in self._silence.passing(effects) if self._silence else effects:
                 if isinstance(effect, Reply):  # answers first, since clients wait for them
                     reply = self._replies.pop(effect.reply_to, None)
                     if reply is not None:
@@ -369,7 +375,8 @@ class ShardHost:
     def _perform(self, effect: Persist | Compare | Call) -> None:
         """Perform an effect that concerns the store or another shard."""
         if isinstance(effect, Persist):
-            self._persist(effect)
+            if self._store_thread is not None:
+                self._store_thread.submit(effect)
         elif isinstance(effect, Compare):
             self._compare(effect)
         elif self._call is not None:
@@ -383,10 +390,6 @@ class ShardHost:
         else:
             level = logging.CRITICAL if effect.grave else logging.INFO
             _log.log(level, "%s: %s", effect.event, effect.text, extra={"event": effect.event})
-
-    def _persist(self, effect: Persist) -> None:
-        if self._store_thread is not None:
-            self._store_thread.submit(effect)
 
     def _persisted(self, tickets: list[int]) -> None:
         """Report to the shard that these tickets are stored."""
@@ -421,9 +424,8 @@ class ShardHost:
                 working = set(filter(self._shard.state.tenures.works, drafts.values()))
             sessions = self._shard.state.sessions.by_id
             self._payloads.sweep(sessions.__contains__, working.__contains__)
-        store_thread = self._store_thread
-        writing_since_s = store_thread.writing_since_s if store_thread is not None else None
-        self._stalls.look(writing_since_s, time.monotonic())
+        writing = self._store_thread.writing_since_s if self._store_thread is not None else None
+        self._stalls.look(writing, time.monotonic())
         with self._mutex:
             if not self._ended:
                 self._handle(Tick(), 0)
@@ -479,6 +481,8 @@ class ShardHost:
 
     def close(self) -> None:
         """Store all pending records, then end; idempotent."""
+        if self._silence is not None:
+            self._silence.end_soon()
         if self._store_thread is not None:
             self._store_thread.close()
         with self._mutex:

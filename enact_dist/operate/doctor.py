@@ -31,6 +31,7 @@ from enact_dist.operate.doctor_cell import (
     warn,
 )
 from enact_dist.operate.doctor_keys import keys
+from enact_dist.operate.doctor_store import database
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterator
@@ -88,7 +89,7 @@ def examine(target: str, *, timeout_s: float = 5.0) -> Iterator[Finding]:
         yield from keys(config)
     kept = yield from _cell(target, config, timeout_s)
     if config is not None:
-        yield from folders(config, kept)
+        yield from database(config) if config.store else folders(config, kept)
 
 
 def _config(target: str) -> CellConfig:

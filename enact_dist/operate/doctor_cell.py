@@ -104,7 +104,15 @@ def differences(
     running = {shard.name: shard for shard in shards if shard.reachable}
     for shard in config.shards:
         if shard.name in running:
-            yield from _folder(shard, kept=is_kept(running[shard.name].epoch))
+            kept = is_kept(running[shard.name].epoch)
+            if not config.store:
+                yield from _folder(shard, kept=kept)
+            elif not kept:
+                yield fail(
+                    f"store of {shard.name}",
+                    "the running shard keeps its data in memory only, and this file names a store",
+                    "save what is needed (enact world export), and start the shard with this file",
+                )
     yield from _catalogue(config, welcomes)
 
 

@@ -7,7 +7,7 @@ import pytest
 from enact_dist.cli import up
 from enact_dist.config.read import load_config
 from enact_dist.errors import LinkError
-from enact_dist.link.daemon import daemon as shard_daemon
+from enact_dist.link.daemon import second_daemon
 from enact_dist.link.zenoh import endpoints
 from enact_dist.operate import supervise
 
@@ -314,7 +314,7 @@ def test_up_waits_for_a_shard_that_is_just_ending(write_cell, monkeypatch):
             raise refusals.pop()
 
     monkeypatch.setattr(endpoints, "somebody_listens", lambda _: True)
-    monkeypatch.setattr(shard_daemon, "refuse_second_daemon", refuse)
+    monkeypatch.setattr(second_daemon, "refuse_second_daemon", refuse)
 
     up._refuse_second(config, config.shards[0])
 

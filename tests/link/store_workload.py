@@ -101,10 +101,10 @@ def flat_record(record):
 class Driver:
     """One run of the shard."""
 
-    def __init__(self, folder, said, seed, unix_s):
+    def __init__(self, folder, said, seed, unix_s, opened=None):
         self.rng = random.Random(seed)
         self.said = os.open(said, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-        self.store, recovered = open_store(folder, unix_s=unix_s)
+        self.store, recovered = opened or open_store(folder, unix_s=unix_s)
         self.now_ns, self.wall_ns = 10**9, unix_s * 10**9
         self.say("opened", recovered.epoch)
         self.shard = Shard(SETTINGS, recovered, now_ns=self.now_ns, wall_ns=self.wall_ns)

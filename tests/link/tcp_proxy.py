@@ -23,6 +23,7 @@ class TcpProxy:
         self.endpoint = f"tcp/127.0.0.1:{self._listener.getsockname()[1]}"
         self.passed = self.cuts = 0
         self._cut_after = None
+        self._refuses = False
         self._open = set()
         self._mutex = threading.Lock()
         self._threads = [threading.Thread(target=self._accept, daemon=True)]
@@ -37,6 +38,15 @@ class TcpProxy:
             with contextlib.suppress(OSError):
                 one.shutdown(socket.SHUT_RDWR)
 
+    def refuse(self):
+        """Break all connections there are, and new ones until `accept_again`."""
+        self._refuses = True
+        self.cut()
+
+    def accept_again(self):
+        """Take new connections again."""
+        self._refuses = False
+
     def cut_after(self, count):
         """Break all connections once so many more bytes went through."""
         self._cut_after = self.passed + count
@@ -47,6 +57,9 @@ class TcpProxy:
                 near, _ = self._listener.accept()
             except OSError:
                 return
+            if self._refuses:
+                near.close()
+                continue
             try:
                 far = socket.create_connection(("127.0.0.1", self._target_port))
             except OSError:

@@ -40,6 +40,8 @@ class ManualClock:
 class FakeStore:
     """A store whose disk the test holds: writes wait for `may_write`, or fail."""
 
+    holding = None
+
     def __init__(self, failure=None):
         self.may_write = threading.Event()
         self.batches = []

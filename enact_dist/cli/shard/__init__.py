@@ -36,13 +36,19 @@ def _store(text: str) -> Option:
 VERBS: Final = (
     Verb(
         "run", "run one shard daemon of the cell until SIGTERM", "shard:run_shard",
-        "enact shard run left --cell cell.toml",
+        "enact shard run left --cell cell.toml\n"
+        "enact shard run left --cell cell.toml --standby",
         (
             _NAME,
             CELL_FILE,
             many("--listen", "ENDPOINT", "replaces `listen` of cell.toml", type=endpoints),
             many("--advertise", "ENDPOINT", "replaces `advertise`", type=endpoints),
             option("--folder", "DIR", "replaces `folder` of cell.toml"),
+            option("--store", "URL",
+                   "replaces `store`: the database that keeps the data of all shards"),
+            flag("--standby",
+                 "in a cell with a store: wait until no other daemon serves the shard, then take"
+                 " over"),
             option("--metrics", "HOST:PORT",
                    "serve /metrics for Prometheus there; a port alone is one of the loopback",
                    type=address),

@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from enact_dist.cli.shard.shard import refuse_database
 from enact_dist.cli.target import cell_config
 from enact_dist.cli.text.output import shown_bytes
 from enact_dist.cli.verbs import Output
@@ -67,6 +68,13 @@ def run_restore(options: argparse.Namespace) -> Output:
 
 
 def _folder(config: CellConfig, options: argparse.Namespace) -> Path:
+    if not options.folder:
+        refuse_database(
+            config,
+            f"enact shard {options.verb.name} copies a folder",
+            "pg_dump -n enact backs all shards up together, pg_restore brings them back while the"
+            " cell is stopped (pg_basebackup: to a point in time)",
+        )
     folder = options.folder or config.shard(options.name).folder
     if folder is None:
         raise ConfigError(

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from enact_dist.cli.arguments import pairs
+from enact_dist.cli.shard.shard import refuse_database
 from enact_dist.cli.target import cell_config
 from enact_dist.cli.text.output import ProgressLine, print_json, print_table, shown_bytes
 from enact_dist.cli.verbs import DONE, FAILED
@@ -32,6 +33,11 @@ def run_forget(options: argparse.Namespace) -> int:
     from enact_dist.link.offline.forgetting import forget, look
 
     config = cell_config(options)
+    refuse_database(
+        config,
+        "enact shard forget deletes aspects from folders",
+        "there is no such command for it yet",
+    )
     folders, elsewhere = _folders(config, pairs(options.store, "--store"), options)
     if not options.aspects and not options.unused:
         raise ConfigError("name the aspects to forget, or --unused for all without data")

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.cli.arguments import pairs
+from enact_dist.cli.shard.shard import refuse_database
 from enact_dist.cli.target import cell_config
 from enact_dist.cli.text.output import ProgressLine, print_json, print_table, shown_bytes
 from enact_dist.cli.verbs import DONE
@@ -32,6 +33,11 @@ def run_rebalance(options: argparse.Namespace) -> int:
     from enact_dist.link.offline.rebalance import look, rebalance
 
     config = cell_config(options)
+    refuse_database(
+        config,
+        "enact shard rebalance moves data between folders",
+        "there is no such command for it yet",
+    )
     stores = pairs(options.store, "--store")
     folders = _folders(config, stores, options.new)
     placement = config.placement_map()

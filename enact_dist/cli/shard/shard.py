@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from enact_dist.cli.target import PROGRAM, cell_target, is_endpoint, open_cell
@@ -18,7 +19,9 @@ if TYPE_CHECKING:
     import argparse
     from collections.abc import Sequence
 
+    from enact_dist.config.types import CellConfig
     from enact_dist.link.daemon.health import ShardHealth
+    from enact_dist.link.postgres.address import StoreAddress
     from enact_dist.world.listings import ShardInfo
 
 
@@ -42,6 +45,8 @@ def run_shard(options: argparse.Namespace) -> int:
     ):
         if found:
             environment[variable_of(options.name, key)] = found
+    if options.store:
+        environment["ENACT_STORE"] = options.store
 
     def settings() -> DaemonSettings:
         # The name comes first: an override for a shard that is not there would blame the override.
@@ -49,11 +54,18 @@ def run_shard(options: argparse.Namespace) -> int:
         config = load_config(target, environment=environment)
         shard = config.shard(options.name)
         drain_s = shard.drain_s if options.drain_s is None else options.drain_s
+        if options.standby and not config.store:
+            raise ConfigError(
+                f"{config.path}: --standby needs a database that both daemons reach: write"
+                ' store = "postgresql://…", or set ENACT_STORE'
+            )
         return DaemonSettings(
             cell=config.name,
             shard=config.shard_settings(shard.name),
             listen=shard.listen,
             folder=shard.folder,
+            store=store_of(config, shard.name),
+            standby=options.standby,
             log=options.log,
             link_lease_s=config.ttl_s / 2,
             carrier=config.carrier,
@@ -67,6 +79,29 @@ def run_shard(options: argparse.Namespace) -> int:
         )
 
     return run_shard_daemon(settings())
+
+
+def store_of(config: CellConfig, shard: str) -> StoreAddress | None:
+    """Return the place of a shard in the database of a cell; None: the cell has none."""
+    from enact_dist.link.postgres.address import StoreAddress
+
+    return StoreAddress(config.store, config.name, shard, config.lease_s) if config.store else None
+
+
+def refuse_database(config: CellConfig, does: str, remedy: str) -> None:
+    """Refuse a command that works on folders in a cell whose data are in a database.
+
+    Raises:
+        ConfigError: They are.
+    """
+    from enact_dist.link.postgres.address import without_password
+
+    if config.store:
+        raise ConfigError(
+            f"{config.path}: {does}, and this cell keeps its data in"
+            f" {without_password(config.store)}: {remedy}",
+            path=str(config.path),
+        )
 
 
 def list_shards(options: argparse.Namespace) -> Output:
@@ -128,7 +163,19 @@ def _health(options: argparse.Namespace) -> list[ShardHealth]:
         name: (*config.shard(name).advertise, *config.shard(name).listen) for name in names
     }
     keys = client_keys(config.security, PROGRAM)
-    return shard_health.of_shards(config.name, endpoints, timeout_s=wait_s, keys=keys)
+    found = shard_health.of_shards(config.name, endpoints, timeout_s=wait_s, keys=keys)
+    return _with_reasons(config, found)
+
+
+def _with_reasons(config: CellConfig, found: list[ShardHealth]) -> list[ShardHealth]:
+    """Return the shards with what the cell's database says of those that do not answer."""
+    if not config.store or all(one.alive for one in found):
+        return found
+    from enact_dist.operate.doctor_store import why_silent
+
+    why = why_silent(config)
+    silent = {one.name: why(one.name) for one in found if not one.alive and not one.problem}
+    return [replace(one, problem=silent.get(one.name, one.problem)) for one in found]
 
 
 def _row(shard: ShardInfo) -> tuple[object, ...]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import gc
 import logging
+import os
 import secrets
 import signal
 import sys
@@ -18,51 +19,48 @@ import threading
 import time
 from contextlib import ExitStack
 from dataclasses import replace
-from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.messages import ListLocks, Locks
 from enact_dist.core.protocol.records import Called, SessionBarred, SessionSeen, ShardReturned
-from enact_dist.errors import ConfigError, EnactError, LinkError
+from enact_dist.errors import ConfigError, EnactError, LinkError, StoreError
 from enact_dist.link.client.calls import Calls
 from enact_dist.link.client.duplicate_daemons import (
     Comparing,
-    expected_places,
-    moved_places,
-    serving,
-    two_daemons,
 )
 from enact_dist.link.daemon.reload import Reload, checked_keys
+from enact_dist.link.daemon.second_daemon import refuse_second_daemon
 from enact_dist.link.daemon.service_manager import ServiceManager
 from enact_dist.link.daemon.settings import DRAIN_S, DaemonSettings
 from enact_dist.link.daemon.shard_calls import ShardCalls
+from enact_dist.link.lease import ShardTakenError
 from enact_dist.link.log import READY, JsonLines, Log, TextLines, say
 from enact_dist.link.memory.shared_folder import SharedFolder
 from enact_dist.link.opening import open_host
+from enact_dist.link.postgres.address import require_driver
 from enact_dist.link.signals import StopSignals
 from enact_dist.link.socket.service import SocketService
-from enact_dist.link.zenoh.config import close_session, listening_settings, open_session, to_reach
-from enact_dist.link.zenoh.discovery import FoundShard, find_shards
-from enact_dist.link.zenoh.endpoints import somebody_listens
+from enact_dist.link.zenoh.config import close_session, listening_settings, open_session
 from enact_dist.link.zenoh.service import ZenohService
 from enact_dist.wire.keys import name_in
 
 if TYPE_CHECKING:
-    from collections.abc import Container, Iterable
+    from collections.abc import Callable, Container, Iterable, Mapping
 
     import zenoh
 
     from enact_dist.core.protocol.messages import Answer
     from enact_dist.link.daemon.metrics import MetricsServer
     from enact_dist.link.host import ShardHost
+    from enact_dist.link.postgres.address import FreeShard
     from enact_dist.link.zenoh.tls import Certificate
 
-PROBE_S: Final = 0.3
-"""How long another daemon with our name may take to answer before we start."""
 RECONNECT_S: Final = 2.0
 """How long clients may take to connect again when the shard has taken new keys."""
 REOPEN_S, REOPEN_PAUSE_S = 5.0, 0.02
 """How long the port may take to be free for the shard's next Zenoh session."""
+TAKE_AGAIN_S: Final = 1.0
+"""Pause of a standby after a takeover that failed."""
 SWITCH_INTERVAL_S: Final = 0.0002
 """With Python's 5 ms a busy store thread would add 7 to 11 ms to a call (p90), measured."""
 GC_THRESHOLDS: Final = (5_000, 20, 1_000_000)
@@ -72,9 +70,20 @@ _log = logging.getLogger("enact.shard")
 
 
 class RunningShard:
-    """A running shard.  Made by `start_shard`; `stop` it before the interpreter exits."""
+    """A running shard.  Made by `start_shard`; `stop` it before the interpreter exits.
 
-    def __init__(self, settings: DaemonSettings) -> None:
+    Args:
+        settings: The settings of the shard.
+        free: The shard in a database that it takes over, in place of a folder.
+        session: The Zenoh session that serves it, which clients know already; None: a new one.
+    """
+
+    def __init__(
+        self,
+        settings: DaemonSettings,
+        free: FreeShard | None = None,
+        session: zenoh.Session | None = None,
+    ) -> None:
         self.settings = settings
         self._ended = threading.Event()
         self._stopping = threading.Lock()
@@ -89,8 +98,8 @@ class RunningShard:
                 undo.callback(self._shared.close)
             self.host: ShardHost = open_host(
                 shard,
-                settings.folder,
-                on_failure=lambda _: self._ended.set(),
+                free or settings.folder,
+                on_failure=self._has_failed,
                 shared=self._shared if settings.shared_bytes_max != 0 else None,
                 payload_bytes_max=settings.shared_bytes_max,
             )
@@ -104,8 +113,9 @@ class RunningShard:
                 self._metrics = _metrics_server(settings, self.host)
                 undo.callback(self._metrics.close)
             self._names = settings.common_names
-            self._session = self._open_session()
-            undo.callback(close_session, self._session)
+            self._session = session or self._open_session()
+            if session is None:
+                undo.callback(close_session, self._session)
             self._calls = ShardCalls(
                 settings.cell,
                 shard.name,
@@ -128,19 +138,15 @@ class RunningShard:
                 self.reload = Reload(self._take_again, self.host.count, settings.keys)
             undo.pop_all()
 
+    def _has_failed(self, failure: Exception) -> None:
+        if isinstance(failure, ShardTakenError):
+            # Another process serves the shard: whatever is still in this one must not leave it.
+            logging.shutdown()
+            os._exit(1)
+        self._ended.set()
+
     def _open_session(self) -> zenoh.Session:
-        settings = self.settings
-        return open_session(
-            listen=settings.listen,
-            lease_s=settings.link_lease_s,
-            keys=settings.keys,
-            more=listening_settings(
-                settings.cell,
-                settings.shard.name,
-                self._names,
-                [entry.name for entry in settings.shard.placement.shards],
-            ),
-        )
+        return _session_of(self.settings, self._names)
 
     def _served(self) -> ZenohService:
         proven = self._names is not None
@@ -279,6 +285,21 @@ class RunningShard:
             )
 
 
+def _session_of(settings: DaemonSettings, names: Mapping[str, str] | None) -> zenoh.Session:
+    """Open the Zenoh session at which a shard listens; `names` are those of clients with keys."""
+    return open_session(
+        listen=settings.listen,
+        lease_s=settings.link_lease_s,
+        keys=settings.keys,
+        more=listening_settings(
+            settings.cell,
+            settings.shard.name,
+            names,
+            [entry.name for entry in settings.shard.placement.shards],
+        ),
+    )
+
+
 def _metrics_server(settings: DaemonSettings, host: ShardHost) -> MetricsServer:
     from enact_dist.link.daemon.metrics import MetricsServer, shown_of
 
@@ -311,53 +332,60 @@ def start_shard(settings: DaemonSettings) -> RunningShard:
         LinkError: An endpoint is in use, or another daemon already serves this shard.
         ConfigError: An endpoint cannot be read, or is missing, or the keys cannot be used.
     """
+    _check(settings)
+    return RunningShard(settings)
+
+
+def _check(settings: DaemonSettings) -> None:
     if not settings.listen:
         raise ConfigError(f"shard {settings.shard.name} has no endpoint to listen at")
     if settings.keys is not None:
         checked_keys(settings.keys, settings.hosts)
     refuse_second_daemon(settings)
-    return RunningShard(settings)
 
 
-def refuse_second_daemon(settings: DaemonSettings, *, probe_s: float | None = None) -> None:
-    """Raise if a daemon already serves this shard at one of its endpoints for clients.
+def take_shard(
+    settings: DaemonSettings, stopped: threading.Event, waiting: Callable[[], None]
+) -> RunningShard | None:
+    """Start a shard in a database once no other daemon serves it; None once `stopped` is set.
 
-    Other running shards of the cell are asked where they expect it.
+    The Zenoh session is open all the while, so clients are connected to a standby before it serves.
 
     Args:
-        settings: Settings of the shard.
-        probe_s: How long a listener there may take to identify itself; None: `PROBE_S`.
+        settings: The settings of the shard, with its place.
+        stopped: Ends the wait.
+        waiting: Called ten times a second.
 
     Raises:
-        LinkError: A daemon does, or another shard of the cell runs twice.
-        ConfigError: An endpoint cannot be read.
+        As `start_shard`; a standby waits for its database, too.
     """
-    probe_s = PROBE_S if probe_s is None else probe_s
-    name, cell = settings.shard.name, settings.cell
-    shards = settings.shard.placement.shards
-    expected = {entry.name: entry.endpoints for entry in shards}
-    ours = (*settings.listen, *expected.get(name, ()), *settings.written)
-    listening = [place for place in dict.fromkeys(map(to_reach, ours)) if somebody_listens(place)]
-    keys = settings.keys
-    found = find_shards(listening, timeout_s=probe_s, keys=keys) if listening else ()
-    if FoundShard(cell, name) in found:
-        raise LinkError(
-            f"shard {name} of cell {cell} already runs at {' or '.join(listening)}; two daemons"
-            " must not serve one shard: stop the other, or give this one another name"
-        )
-    others = [entry for entry in shards if entry.name != name]
-    reported = expected_places(cell, others, timeout_s=probe_s, keys=keys) if others else ()
-    for shard, places in moved_places(expected, chain.from_iterable(reported)).items():
-        daemons = serving(cell, shard, places, timeout_s=probe_s, keys=keys)
-        if shard == name and daemons:
-            raise LinkError(
-                f"shard {name} of cell {cell} already runs at {daemons[0]}, where other shards of"
-                f" the cell expect it; this start would listen at {', '.join(settings.listen)};"
-                " two daemons must not serve one shard: stop the other first, and let the cell.toml"
-                " of every shard name the same endpoint"
-            )
-        if len(daemons) > 1:
-            raise LinkError(two_daemons(cell, shard, daemons))
+    assert settings.store is not None
+    require_driver(settings.store.url)
+    from enact_dist.link.postgres.standby import wait_free
+
+    _check(settings)
+    name, patient = settings.shard.name, settings.standby
+    with ExitStack() as undo:
+        session = _session_of(settings, settings.common_names)
+        undo.callback(close_session, session)
+        while free := wait_free(
+            settings.store,
+            stopped=stopped,
+            patient=patient,
+            note=lambda text: _log.info("shard %s stands by: %s", name, text),
+            looked=waiting,
+        ):
+            try:
+                shard = RunningShard(settings, free, session)
+            except StoreError as error:
+                if not patient:
+                    raise
+                _log.warning("shard %s stands by again: %s", name, error)
+                stopped.wait(TAKE_AGAIN_S)
+            else:
+                undo.pop_all()
+                return shard
+    return None
 
 
 def run_shard(settings: DaemonSettings) -> int:
@@ -367,13 +395,15 @@ def run_shard(settings: DaemonSettings) -> int:
     formatter = _formatter(settings)
     with Log(formatter), StopSignals() as signals:
         try:
-            shard = start_shard(settings)
+            shard = _started(settings, signals.event, manager, formatter)
         except EnactError as error:
             if settings.log == "json":
                 _log.critical("shard %s: %s", name, error, extra={"event": "shard.refused"})
             else:
                 print(f"shard {name}: {error}", file=sys.stderr, flush=True)
             return 1
+        if shard is None:
+            return 0
         try:
             signals.call(lambda word: _stop(shard, word, manager))
             signals.call_again(lambda _: shard.stop_now())
@@ -387,6 +417,29 @@ def run_shard(settings: DaemonSettings) -> int:
         finally:
             shard.stop(drain_s=settings.drain_s)
         return 1 if shard.failure is not None else 0
+
+
+def _started(
+    settings: DaemonSettings,
+    stopped: threading.Event,
+    manager: ServiceManager,
+    formatter: logging.Formatter,
+) -> RunningShard | None:
+    if settings.store is None:
+        return start_shard(settings)
+    if not settings.standby:
+        return take_shard(settings, stopped, lambda: None)
+    text = f"standing by for shard {settings.shard.name} of cell {settings.cell}"
+    told = threading.Event()
+
+    def waiting() -> None:
+        if not told.is_set():
+            told.set()
+            say(formatter, "shard.standby", text, endpoints=settings.listen)
+            manager.ready(text)
+        manager.alive(text)
+
+    return take_shard(settings, stopped, waiting)
 
 
 def _formatter(settings: DaemonSettings) -> logging.Formatter:
@@ -403,7 +456,8 @@ def _stop(shard: RunningShard, name: str, manager: ServiceManager) -> None:
 
 def _say_ready(shard: RunningShard, formatter: logging.Formatter) -> None:
     settings, epoch = shard.settings, shard.host.epoch
-    folder = str(settings.folder) if settings.folder else None
+    place = settings.store or settings.folder
+    folder = str(place) if place else None
     data = f"data in {folder}" if folder else "data in memory only"
     text = (
         f"{READY} shard {settings.shard.name} of cell {settings.cell} at"

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from enact_dist.core.shard.state import ShardSettings
+    from enact_dist.link.postgres.address import StoreAddress
     from enact_dist.link.zenoh.tls import KeyFiles
 
 DRAIN_S: Final = 0.8
@@ -44,6 +45,8 @@ class DaemonSettings:
         keys: The files by which the shard proves its name, in a cell with keys.
         names: Names of clients that have a key.
         again: Reads the settings anew; a reload takes keys, names and rights from them.
+        store: Its place in a database, in place of a folder.
+        standby: Whether it waits for the end of another daemon that serves the shard.
     """
 
     cell: str
@@ -60,6 +63,8 @@ class DaemonSettings:
     keys: KeyFiles | None = None
     names: tuple[str, ...] = ()
     again: Callable[[], DaemonSettings] | None = None
+    store: StoreAddress | None = None
+    standby: bool = False
 
     @property
     def common_names(self) -> dict[str, str] | None:

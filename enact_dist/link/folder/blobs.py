@@ -97,6 +97,10 @@ class BlobFolder:
             os.close(descriptor)
         return blob._replace(synced=True)
 
+    def place(self, name: str) -> Path:
+        """Return the path of a file."""
+        return self.folder / name
+
     def sync_names(self) -> None:
         """Make the names of all files written so far durable."""
         sync_folder(self.folder)

@@ -34,6 +34,10 @@ _RESTORE: Final = (
     "restore the whole folder from a backup, or give the shard an empty folder and start without"
     " its data"
 )
+_RESTORE_TABLES: Final = (
+    "restore the database from a backup (pg_restore), or give the cell another name and start"
+    " without its data"
+)
 
 _log = logging.getLogger("enact.store")
 
@@ -54,8 +58,10 @@ class FolderFindings(NamedTuple):
         return self.mark.is_first if self.mark is not None else self.is_new
 
 
-def refuse_strangers(folder: Path, stored: Recovered, shard: str, placement: PlacementMap) -> None:
-    """Refuse a folder with entities that no client would look for there.
+def refuse_strangers(
+    folder: Path | str, stored: Recovered, shard: str, placement: PlacementMap
+) -> None:
+    """Refuse a folder or database with entities that no client would look for there.
 
     Raises:
         StoreError: The cell's placement puts some entities on other shards.
@@ -72,8 +78,8 @@ def refuse_strangers(folder: Path, stored: Recovered, shard: str, placement: Pla
         )
 
 
-def refuse_far_stamps(folder: Path, stored: Recovered, *, wall_ns: int) -> None:
-    """Refuse a folder whose clock is exhausted; warn of one that is ahead of its host.
+def refuse_far_stamps(folder: Path | str, stored: Recovered, *, wall_ns: int) -> None:
+    """Refuse a folder or database whose clock is exhausted; warn of one that is ahead of its host.
 
     Raises:
         StoreError: A timestamp exceeds the range of the clock.
@@ -98,12 +104,13 @@ def refuse_far_stamps(folder: Path, stored: Recovered, *, wall_ns: int) -> None:
         )
 
 
-def refuse(path: Path, found: str, remedy: str = _RESTORE) -> NoReturn:
-    """Raise the `StoreError` about a damaged file.
+def refuse(path: Path | str, found: str, remedy: str = "") -> NoReturn:
+    """Raise the `StoreError` about a damaged file, or about a table, which `path` names as text.
 
     Raises:
         StoreError: Always.
     """
+    remedy = remedy or (_RESTORE_TABLES if isinstance(path, str) else _RESTORE)
     raise StoreError(f"{path} {found}; the shard does not start: {remedy}", path=str(path))
 
 

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.datum import LockId, Slot
     from enact_dist.core.protocol.messages import AspectEntry, Cause
     from enact_dist.core.protocol.records import Persist, Record
-    from enact_dist.link.folder.blobs import BlobFolder
+    from enact_dist.link.store.media import Bodies
     from enact_dist.link.store.states import Outcomes
 
 
@@ -237,11 +237,11 @@ class Batch:
 
     # ---------------------------------------------------------------- files and rows
 
-    def settle(self, blobs: BlobFolder) -> list[Blob]:
-        """Write large bodies to files and record the rows that name them.
+    def settle(self, bodies: Bodies) -> list[Blob]:
+        """Hand large bodies to the medium and record the rows that name them.
 
         Returns:
-            The files without a row once the batch is committed.
+            The bodies without a row once the batch is committed.
 
         Raises:
             OSError: As the system reports it.
@@ -256,10 +256,10 @@ class Batch:
                 continue
             blob, body = self._shared_blob(staged), record.datum
             if blob is None and body is not None and body.size > INLINE_BYTES_MAX:
-                blob = blobs.write(body.body, durable=durable)
+                blob = bodies.write(body.body, durable=durable)
                 names_to_sync |= durable
             elif blob is not None and durable and not blob.synced:
-                blob = blobs.force(blob)
+                blob = bodies.force(blob)
                 names_to_sync = True
             if blob is not None:
                 self._states.name_blob(key, blob)
@@ -268,7 +268,7 @@ class Batch:
                 shared = self._shared_cause(key, record.cause, causes)
             self.changes[key] = slot_body(record, blob, shared)
         if names_to_sync:
-            blobs.sync_names()
+            bodies.sync_names()
         for cause in self._unnamed_causes:
             if self._states.unname_cause(cause):
                 self.changes[cause] = None

@@ -67,6 +67,9 @@ class FolderMedium:
         bodies: Its large bodies.
     """
 
+    holding = None
+    """The lock of the folder holds it."""
+
     def __init__(self, folder: Path, *, lock: FolderLock, database: Database, epoch: int) -> None:
         self.name = str(folder)
         self.bodies = BlobFolder(folder / BLOB_FOLDER, epoch=epoch)

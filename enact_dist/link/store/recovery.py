@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Final
 import msgpack
 
 from enact_dist.core.protocol.records import Recovered, SlotRecord
-from enact_dist.link.folder.blobs import Blob, BlobFolder, DamagedBlobError, Mapped
+from enact_dist.link.folder.blobs import Blob, DamagedBlobError, Mapped
 from enact_dist.link.folder.folder import refuse
 from enact_dist.link.store.fields import DamagedRowError
 from enact_dist.link.store.rows import (
@@ -51,7 +51,8 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.datum import LockId, Slot
     from enact_dist.core.protocol.messages import Cause
     from enact_dist.core.protocol.records import AuditRecord
-    from enact_dist.link.store.database import Database, DatabaseRow
+    from enact_dist.link.store.database import DatabaseRow
+    from enact_dist.link.store.media import BodySource, RowSource
 
 _UNREADABLE: Final = (
     DamagedRowError,
@@ -110,14 +111,14 @@ class Contents:
     batch: int = 0
 
 
-def read_contents(database: Database, path: Path) -> Contents:
+def read_contents(source: RowSource, path: Path | str) -> Contents:
     """Read and check all rows, and separate newest states from history.
 
     Raises:
         StoreError: A row is damaged, or names a missing row.
     """
     contents = Contents()
-    for row in database.rows():
+    for row in source.rows():
         try:
             _read_row(row, contents)
         except _UNREADABLE as damage:
@@ -183,7 +184,7 @@ def _sort_states(slot: Slot, rows: list[tuple[RowOrder, Key]], contents: Content
         contents.states.history[slot] = history
 
 
-def read_blobs(contents: Contents, blobs: BlobFolder, *, power_cut: bool) -> None:
+def read_blobs(contents: Contents, blobs: BodySource, *, power_cut: bool) -> None:
     """Map every blob file and assign the bodies to states; see above for the checks.
 
     Raises:
@@ -211,7 +212,7 @@ def read_blobs(contents: Contents, blobs: BlobFolder, *, power_cut: bool) -> Non
             continue
         if blob.synced or not power_cut:
             refuse(
-                blobs.folder / blob.name,
+                blobs.place(blob.name),
                 f"holds {record.slot}, version {record.version}, and cannot be used: {file}",
             )
         _log.warning("%s was lost in a power cut: %s", record.slot, file)
@@ -220,14 +221,14 @@ def read_blobs(contents: Contents, blobs: BlobFolder, *, power_cut: bool) -> Non
         contents.records[key] = contents.lost[key] = lost
 
 
-def _mapped(blobs: BlobFolder, blob: Blob, *, whole: bool) -> Mapped | DamagedBlobError:
+def _mapped(blobs: BodySource, blob: Blob, *, whole: bool) -> Mapped | DamagedBlobError:
     try:
         return blobs.map(blob, whole=whole)
     except DamagedBlobError as damage:
         return damage
 
 
-def put_together(contents: Contents, path: Path) -> None:
+def put_together(contents: Contents, path: Path | str) -> None:
     """Return states, operator actions and prepared locks in the form of the core.
 
     Raises:

@@ -50,6 +50,7 @@ if TYPE_CHECKING:
 
     from enact_dist.core.protocol.records import Persist
     from enact_dist.link.folder.blobs import Blob
+    from enact_dist.link.store.media import Medium
     from enact_dist.link.store.recovery import Contents
 
 FOLDER_MODE: Final = 0o700
@@ -120,10 +121,12 @@ class Store:
 
     Attributes:
         batch: Number of the newest batch.
+        holding: For how long this process holds the shard; None: until `close`.
     """
 
-    def __init__(self, medium: FolderMedium, contents: Contents, *, wall_ns: int) -> None:
+    def __init__(self, medium: Medium, contents: Contents, *, wall_ns: int) -> None:
         self._medium = medium
+        self.holding = medium.holding
         self._ids = contents.ids
         self._states = contents.states
         locks = (outcome.lock for outcome in contents.recovered.outcomes)

@@ -1,0 +1,167 @@
+"""How long a shard in a database may answer, and what it keeps back afterwards.
+
+The fence of the database keeps a daemon that has lost its shard from writing.  Its answers come
+from memory, so it must fall silent by itself, before another daemon can serve: it may answer until
+the *send time* of its last confirmed batch or renewal plus the lease, less the drift of two clocks.
+Only monotonic clocks count.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from typing import TYPE_CHECKING, Final, Protocol
+
+from enact_dist.core.protocol.messages import Refused
+from enact_dist.core.protocol.records import Persist, Story
+from enact_dist.errors import StoreError
+from enact_dist.terms import Durability
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from enact_dist.core.protocol.messages import Commit, Prepare
+    from enact_dist.core.protocol.records import Effect
+    from enact_dist.core.shard.state import ShardState
+
+DRIFT: Final = 0.02
+"""How much two monotonic clocks may differ: the holder counts less, who waits counts more."""
+DATABASE_BODY_BYTES_MAX: Final = 256 << 20
+"""Largest body of a datum that a database takes."""
+_STAY: Final = (Persist, Story)
+"""Effects that reach no client and no other shard."""
+_log = logging.getLogger("enact.shard")
+
+
+class ShardTakenError(StoreError):
+    """Another process has the shard: this one must end and answer nothing more."""
+
+
+class Lease:
+    """How long this process may answer for its shard.  Thread-safe.
+
+    Args:
+        lease_s: Its length.
+        now_s: The monotonic clock.
+
+    Attributes:
+        usable_s: How long it holds after a write was sent.
+        held_until_s: When it ends, on that clock.
+    """
+
+    def __init__(self, lease_s: float, now_s: Callable[[], float] = time.monotonic) -> None:
+        self.lease_s = lease_s
+        self.usable_s = lease_s * (1 - DRIFT)
+        self.held_until_s = 0.0
+        self._now_s = now_s
+
+    @property
+    def holds(self) -> bool:
+        """Whether no other process can serve the shard yet."""
+        return self._now_s() < self.held_until_s
+
+    @property
+    def left_s(self) -> float:
+        """How long it still holds; below 0: it has ended."""
+        return self.held_until_s - self._now_s()
+
+    def now_s(self) -> float:
+        """Return the time, to be taken before a write is sent."""
+        return self._now_s()
+
+    def confirmed(self, sent_s: float) -> None:
+        """Take note that a write which was sent at `sent_s` is confirmed."""
+        # Two threads may do this at once: the lesser time does no harm.
+        self.held_until_s = max(self.held_until_s, sent_s + self.usable_s)
+
+
+class Holding(Protocol):
+    """A shard that this process holds for as long as it renews its lease."""
+
+    @property
+    def lease(self) -> Lease:
+        """How long this process may answer."""
+
+    def on_failure(self, failed: Callable[[Exception], None]) -> None:
+        """Call `failed`, once, when the lease cannot be renewed any more."""
+
+    def end_soon(self) -> None:
+        """Wait for no database from now on; from any thread."""
+
+
+class HeldStore(Protocol):
+    """A store, of which only this is asked."""
+
+    @property
+    def holding(self) -> Holding | None:
+        """For how long this process holds the shard; None: until its end."""
+
+
+class Silence:
+    """Keeps back effects that leave the process while the lease has ended.
+
+    Once it is renewed in the same epoch they go out, in order: no other process can have written.
+    Not thread-safe, but for `end_soon`.
+    """
+
+    def __init__(self, holding: Holding, count: Callable[[str], None]) -> None:
+        self.end_soon = holding.end_soon
+        self._lease = holding.lease
+        self._count = count
+        self._kept: list[Effect] = []
+        self._silent = False
+
+    @classmethod
+    def of(
+        cls,
+        store: HeldStore | None,
+        count: Callable[[str], None],
+        failed: Callable[[Exception], None],
+    ) -> Silence | None:
+        """Return the silence of a store's lease; None: it needs none, for it is held to its end.
+
+        Args:
+            store: The store.
+            count: Called with the name of a counter to add one to.
+            failed: Called once, when the lease cannot be renewed any more.
+        """
+        holding = store.holding if store is not None else None
+        if holding is None:
+            return None
+        holding.on_failure(failed)
+        return cls(holding, count)
+
+    def too_large(self, commit: Commit | Prepare, state: ShardState) -> Refused | None:
+        """Return why a commit is refused whose data no database keeps, None if it is not."""
+        for slot, datum in commit.writes:
+            if datum is None or datum.size <= DATABASE_BODY_BYTES_MAX:
+                continue
+            entry = state.catalogue.aspects.get(slot.aspect)
+            if entry is not None and entry.durability != Durability.VOLATILE.value:
+                self._count("data_too_large")
+                return Refused(
+                    "no_room",
+                    f"{datum.size} bytes for {slot} are more than a database keeps of one datum"
+                    f" ({DATABASE_BODY_BYTES_MAX}): make the aspect {slot.aspect} volatile, or keep"
+                    " its shard in a folder",
+                )
+        return None
+
+    def passing(self, effects: Sequence[Effect]) -> Sequence[Effect]:
+        """Return the effects to perform now, those kept back before them."""
+        if self._lease.holds:
+            if not self._silent:
+                return effects
+            kept, self._kept, self._silent = self._kept, [], False
+            _log.warning("the lease is renewed: %d answers that waited go out", len(kept))
+            return [*kept, *effects]
+        if not self._silent:
+            self._silent = True
+            self._count("silences")
+            _log.warning(
+                "the database has confirmed nothing for %.1f s, so another daemon may take the"
+                " shard over: answers wait",
+                self._lease.usable_s - self._lease.left_s,
+            )
+        self._kept += [effect for effect in effects if not isinstance(effect, _STAY)]
+        return [effect for effect in effects if isinstance(effect, _STAY)]

@@ -1,0 +1,1 @@
+"""The store of a shard in PostgreSQL: rows, bodies, fence, lease, takeover."""

@@ -1,0 +1,73 @@
+"""Names the place of a shard in a PostgreSQL database; loads no driver."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+from enact_dist.errors import StoreError
+
+LEASE_S_DEFAULT: Final = 2.0
+"""How long a shard may answer after its last confirmed write, seconds."""
+_PASSWORD: Final = re.compile(r"(?<=://)([^/@:]*):[^/@]*@|([?&])password=[^&]*")
+
+
+@dataclass(frozen=True, slots=True)
+class StoreAddress:
+    """The place of one shard in a database.
+
+    Attributes:
+        url: The database, with one host or several, as libpq reads it.
+        cell: Name of the cell.
+        shard: Name of the shard.
+        lease_s: How long its daemon may answer after its last confirmed write, seconds.
+    """
+
+    url: str
+    cell: str
+    shard: str
+    lease_s: float = LEASE_S_DEFAULT
+
+    def __str__(self) -> str:
+        """Return it for people, without a password."""
+        return f"{without_password(self.url)} (shard {self.shard} of cell {self.cell})"
+
+
+class SeenRow(NamedTuple):
+    """A shard's row as it was last seen; a takeover is conditional on the first two."""
+
+    epoch: int
+    beat: int
+    holder: str = ""
+
+
+class FreeShard(NamedTuple):
+    """A shard that no process held when it was last seen."""
+
+    address: StoreAddress
+    seen: SeenRow
+
+
+class ShardHeldError(StoreError):
+    """Another process serves the shard."""
+
+
+def require_driver(url: str) -> None:
+    """Refuse a database for which no driver is installed.
+
+    Raises:
+        StoreError: psycopg cannot be imported.
+    """
+    try:
+        import psycopg  # noqa: F401 - whether it can be
+    except ImportError as error:
+        raise StoreError(
+            f"the store {without_password(url)} needs psycopg, which cannot be imported ({error}):"
+            " pip install 'enact-dist[postgres]'"
+        ) from error
+
+
+def without_password(url: str) -> str:
+    """Return the URL of a database for people."""
+    return _PASSWORD.sub(lambda found: f"{found[1]}@" if found[1] is not None else "", url)

@@ -1,0 +1,147 @@
+"""Connections to the database of a shard, and which errors mean that one was lost.
+
+Rules that a change must keep:
+
+- Nothing may cancel a commit that waits for the standby: no `statement_timeout`, no cancel of ours.
+  PostgreSQL reports a cancelled wait as success, with a warning; so **any** warning on such a
+  connection is an error of the store.
+- No pooler in transaction mode may stand in between: settings and prepared statements belong to the
+  session.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, Final
+
+import psycopg
+from psycopg import errors
+from psycopg.conninfo import conninfo_to_dict
+
+from enact_dist.errors import StoreError
+from enact_dist.link.postgres.address import without_password
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+CONNECT_S: Final = 2
+"""How long one host may take to answer a connection."""
+_KEYWORDS: Final[dict[str, Any]] = {
+    "target_session_attrs": "read-write",
+    "connect_timeout": CONNECT_S,
+    "tcp_user_timeout": 3000,  # ms
+    "keepalives_idle": 1,
+    "keepalives_interval": 1,
+    "keepalives_count": 3,
+}
+_OPTIONS: Final = (
+    "-c statement_timeout=0 -c lock_timeout=5s -c idle_in_transaction_session_timeout=5s"
+    " -c tcp_user_timeout=3000 -c client_connection_check_interval=1s"
+    " -c plan_cache_mode=force_generic_plan -c client_min_messages=warning"
+)
+CONFIRMED: Final = "on"
+"""`synchronous_commit` of what must be forced to the disks of both hosts."""
+RECEIVED: Final = "remote_write"
+"""Of what the system of the other host has got; less than that is lost with a failover."""
+LOST: Final = (psycopg.OperationalError, psycopg.InterfaceError, errors.ReadOnlySqlTransaction)
+"""Errors of a connection, of which `is_lost` picks those that a new one may mend."""
+
+
+class Connector:
+    """Connects to whichever host of a database takes writes, the last good one first.
+
+    Args:
+        url: The database.
+        who: Who connects, for the database's own list.
+    """
+
+    def __init__(self, url: str, who: str) -> None:
+        self.shown = without_password(url)
+        found = conninfo_to_dict(url)
+        self._hosts = str(found.pop("host", "") or "").split(",")
+        ports = str(found.pop("port", "") or "").split(",")
+        self._ports = ports if len(ports) == len(self._hosts) else ports[:1] * len(self._hosts)
+        options = f"{found.pop('options', '') or ''} {_OPTIONS}".strip()
+        self._rest = {**found, **_KEYWORDS, "options": options, "application_name": who}
+
+    def connect(self) -> DatabaseSession:
+        """Connect.
+
+        Raises:
+            psycopg.OperationalError: No host takes writes now.
+        """
+        places = {"host": ",".join(self._hosts), "port": ",".join(self._ports)}
+        known = {key: text for key, text in places.items() if text.strip(",")}
+        connection = psycopg.connect(autocommit=True, **{**self._rest, **known})
+        connection.prepare_threshold = 0
+        with suppress(ValueError):  # a folder of sockets, or a host that is named otherwise
+            at = list(zip(self._hosts, self._ports, strict=True)).index(
+                (connection.info.host, str(connection.info.port))
+            )
+            for some in (self._hosts, self._ports):
+                some.insert(0, some.pop(at))
+        return DatabaseSession(connection)
+
+
+class DatabaseSession:
+    """One connection, with its class of durability and the warnings that came over it."""
+
+    def __init__(self, connection: psycopg.Connection[tuple[Any, ...]]) -> None:
+        self.connection = connection
+        self._class = ""
+        self._warnings: list[str] = []
+        connection.add_notice_handler(self._warned)
+
+    def _warned(self, notice: errors.Diagnostic) -> None:
+        self._warnings.append(f"{notice.sqlstate} {notice.message_primary}")
+
+    def commit_as(self, level: str) -> None:
+        """Choose what the next commits survive: `CONFIRMED` or `RECEIVED`."""
+        if level != self._class:
+            self.connection.execute(f"SET synchronous_commit = {level}")
+            self._class = level
+
+    def row(self, statement: str, values: Sequence[object] = ()) -> tuple[Any, ...] | None:
+        """Execute a statement; return its first row.
+
+        Raises:
+            StoreError: The database warned.
+            psycopg.Error: As the database reports it.
+        """
+        cursor = self.connection.execute(statement.encode(), values)
+        found = cursor.fetchone() if cursor.description else None
+        self.check()
+        return found
+
+    def check(self) -> None:
+        """Refuse what was committed while the database warned.
+
+        Raises:
+            StoreError: It did: a commit may stand on one host only.
+        """
+        if self._warnings:
+            raise StoreError(
+                f"the database warned ({'; '.join(self._warnings)}), so a commit that it reported"
+                " may stand on one of its hosts only: look at the database's log, and start the"
+                " shard again"
+            )
+
+    def close(self) -> None:
+        """Close the connection; idempotent."""
+        with suppress(psycopg.Error):
+            self.connection.close()
+
+
+def is_lost(failure: Exception, session: DatabaseSession | None) -> bool:
+    """Whether a new connection may mend an error: it was lost, or another one held the row."""
+    if isinstance(failure, errors.LockNotAvailable | errors.ReadOnlySqlTransaction):
+        return True
+    connection = session.connection if session is not None else None
+    return connection is None or connection.closed or connection.broken
+
+
+def myself() -> str:
+    """Return this process, as the holder of a shard and in the database's list of connections."""
+    return f"{socket.gethostname()} {os.getpid()}"

@@ -1,0 +1,106 @@
+"""Looks at the database of a cell for an operator: whether it answers, what it holds, its copies.
+
+It changes nothing and takes nothing over.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+import psycopg
+
+from enact_dist.errors import StoreError
+from enact_dist.link.postgres.connection import Connector, myself
+from enact_dist.link.postgres.medium import in_one_line, remedy_of
+from enact_dist.link.postgres.tables import COPIES, MISSING, SHARDS, STANDBYS
+
+if TYPE_CHECKING:
+    from enact_dist.link.postgres.connection import DatabaseSession
+
+_SYNCHRONOUS: Final = frozenset({"sync", "quorum"})
+
+
+@dataclass(frozen=True, slots=True)
+class ShardRow:
+    """A shard in a database.
+
+    Attributes:
+        holder: Host and process that serve it; empty: none does.
+        epoch: Its epoch.
+        batch: Number of its newest batch.
+        standbys: Hosts and processes that stand by for it.
+    """
+
+    holder: str
+    epoch: int
+    batch: int
+    standbys: tuple[str, ...] = ()
+
+
+@dataclass(slots=True)
+class DatabaseReport:
+    """What was found of a database.
+
+    Attributes:
+        problem: Why it cannot be used; empty: it can.
+        remedy: What to do about that.
+        took_s: How long a connection took.
+        version: Version of the server.
+        missing: Tables that are not there.
+        copies: Names of the standbys that confirm commits.
+        others: Names of other standbys, with their states.
+        named: What `synchronous_standby_names` says.
+        shards: The shards of the cell.
+    """
+
+    problem: str = ""
+    remedy: str = ""
+    took_s: float = 0.0
+    version: str = ""
+    missing: tuple[str, ...] = ()
+    copies: tuple[str, ...] = ()
+    others: tuple[str, ...] = ()
+    named: str = ""
+    shards: dict[str, ShardRow] = field(default_factory=dict)
+
+
+def examine_database(url: str, cell: str) -> DatabaseReport:
+    """Look at the database of a cell."""
+    found = DatabaseReport()
+    started_s = time.monotonic()
+    try:
+        session = Connector(url, f"enact doctor on {myself()}").connect()
+    except psycopg.Error as error:
+        found.problem, found.remedy = in_one_line(error), remedy_of(error)
+        return found
+    found.took_s = time.monotonic() - started_s
+    try:
+        _fill(found, session, cell)
+    except psycopg.Error as error:
+        found.problem, found.remedy = in_one_line(error), remedy_of(error)
+    except StoreError as error:
+        found.problem, found.remedy = str(error), "look at the database's log"
+    finally:
+        session.close()
+    return found
+
+
+def _fill(found: DatabaseReport, session: DatabaseSession, cell: str) -> None:
+    found.version = str((session.row("SHOW server_version") or ("unknown",))[0])
+    found.named = str((session.row("SHOW synchronous_standby_names") or ("",))[0])
+    found.missing = tuple((session.row(MISSING) or (None,))[0] or ())
+    for name, sync, state in session.connection.execute(COPIES):
+        if sync in _SYNCHRONOUS:
+            found.copies += (name,)
+        else:
+            found.others += (f"{name} ({sync or 'not visible'}, {state or 'not visible'})",)
+    if found.missing:
+        return
+    standbys: dict[int, tuple[str, ...]] = {}
+    for text in session.connection.execute(STANDBYS):
+        _, shard, who = text[0].split("/", 2)
+        standbys[int(shard)] = (*standbys.get(int(shard), ()), who)
+    for row_id, name, epoch, batch, holder in session.connection.execute(SHARDS, (cell,)):
+        found.shards[name] = ShardRow(holder, epoch, batch, standbys.get(row_id, ()))

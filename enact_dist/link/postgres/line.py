@@ -1,0 +1,241 @@
+"""A line to a shard's row: connects again when it is lost, and renews the shard's lease.
+
+After a loss the next connection asks what became of an act.  *It is there* is believed only after
+another commit that the standby has confirmed: the database's log is one sequence, so that confirms
+all that was read before it.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from contextlib import suppress
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import psycopg
+from psycopg import errors
+
+from enact_dist.errors import StoreError
+from enact_dist.link.lease import ShardTakenError
+from enact_dist.link.postgres.connection import CONFIRMED, LOST, is_lost
+from enact_dist.link.postgres.tables import REACHED, RENEW, RESIGN
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from enact_dist.link.lease import Lease
+    from enact_dist.link.postgres.connection import Connector, DatabaseSession
+
+RENEW_S: Final = 0.4
+"""A lease is renewed when nothing was confirmed for this long."""
+AGAIN_S: Final = 0.1
+"""Pause before another try to connect."""
+CLOSE_S: Final = 1.0
+"""How long a closing store still tries to reach its database."""
+_log = logging.getLogger("enact.store")
+
+
+class HeldRow(NamedTuple):
+    """Which row of the shards a process holds, in which epoch, and until when it may answer."""
+
+    connector: Connector
+    shard: int
+    epoch: int
+    lease: Lease
+    name: str
+
+
+class Line:
+    """One connection in the service of a tenure.  Used by one thread at a time, but for `end`.
+
+    Args:
+        tenure: What it writes for.
+        session: An open connection, None: it connects at the first act.
+
+    Attributes:
+        reconnects: How often it has connected again.
+    """
+
+    def __init__(self, tenure: HeldRow, session: DatabaseSession | None = None) -> None:
+        self._tenure = tenure
+        self._session = session
+        self._ending = threading.Event()
+        self._ends_s: float | None = None
+        self._is_away = False
+        self.reconnects = 0
+
+    def end_soon(self) -> None:
+        """Let an act that cannot reach the database fail within `CLOSE_S`; from any thread."""
+        self._ends_s = self._tenure.lease.now_s() + CLOSE_S
+        self._ending.set()
+
+    def again(
+        self, act: Callable[[DatabaseSession], None], done: Callable[[DatabaseSession], bool]
+    ) -> None:
+        """Act, and confirm the lease; wait for the database as long as it takes.
+
+        Args:
+            act: Writes, in one transaction that is conditional on the epoch; no row of the shard
+                is an `errors.DivisionByZero`.
+            done: Asks whether an act whose answer was lost has been done.
+
+        Raises:
+            ShardTakenError: Another process has the shard.
+            StoreError: The database warned, or stayed away from a store that ends.
+            psycopg.Error: As the database reports it, except for lost connections.
+        """
+        tenure, uncertain = self._tenure, False
+        while True:
+            try:
+                session = self._connected()
+                sent_s = tenure.lease.now_s()
+                if uncertain and done(session):
+                    self._confirm(session)
+                else:
+                    uncertain = True
+                    act(session)
+                    session.check()
+            except errors.DivisionByZero:
+                # Another has the shard, or an earlier try was committed while this one waited.
+                continue
+            except LOST as failure:
+                self._lost(failure)
+                continue
+            tenure.lease.confirmed(sent_s)
+            self._back()
+            return
+
+    def _confirm(self, session: DatabaseSession) -> None:
+        session.commit_as(CONFIRMED)
+        if session.row(RENEW, (self._tenure.shard, self._tenure.epoch)) is None:
+            raise self.taken()
+
+    def renew(self) -> None:
+        """Renew the lease by a write of its own.
+
+        Raises:
+            As `again`.
+        """
+        self.again(self._confirm, lambda _: False)
+
+    def reached(self, session: DatabaseSession) -> int:
+        """Return the number of the newest batch in the database.
+
+        Raises:
+            ShardTakenError: Another process has the shard.
+        """
+        found = session.row(REACHED, (self._tenure.shard,))
+        if found is None or found[0] != self._tenure.epoch:
+            raise self.taken()
+        return int(found[1])
+
+    def resign(self) -> None:
+        """Free the shard, so that a standby need not wait for the end of the lease."""
+        with suppress(psycopg.Error, StoreError):
+            session = self._connected()
+            session.commit_as(CONFIRMED)
+            session.row(RESIGN, (self._tenure.shard, self._tenure.epoch))
+
+    def close(self) -> None:
+        """Close the connection; idempotent."""
+        if self._session is not None:
+            self._session.close()
+            self._session = None
+
+    def taken(self) -> ShardTakenError:
+        """Return the error of a process whose shard another one serves."""
+        return ShardTakenError(
+            f"{self._tenure.name} has another holder since epoch {self._tenure.epoch}: this"
+            " process was silent for longer than lease_s, so a standby took over",
+            path=self._tenure.name,
+        )
+
+    # ---------------------------------------------------------------- connections
+
+    def _connected(self) -> DatabaseSession:
+        if self._session is None:
+            self._session = self._tenure.connector.connect()
+            self.reconnects += 1
+        return self._session
+
+    def _lost(self, failure: Exception) -> None:
+        """Give a connection up and pause.
+
+        Raises:
+            StoreError: The store ends.
+            Exception: `failure`, which no new connection mends.
+        """
+        if not is_lost(failure, self._session):
+            raise failure
+        self.close()
+        was_away, self._is_away = self._is_away, True
+        if not was_away:
+            _log.warning("%s cannot be reached; waiting for it: %s", self._tenure.name, failure)
+        if self._ends_s is not None and self._tenure.lease.now_s() > self._ends_s:
+            raise StoreError(
+                f"{self._tenure.name} cannot be reached ({failure}), and the shard ends: what it"
+                " has not acknowledged may be lost",
+                path=self._tenure.name,
+            ) from failure
+        if was_away:
+            self._ending.wait(AGAIN_S)
+
+    def _back(self) -> None:
+        if self._is_away:
+            self._is_away = False
+            _log.warning("%s is reached again", self._tenure.name)
+
+
+class Renewer:
+    """Renews the lease of an idle store, on a line and a thread of its own.
+
+    Args:
+        tenure: Whose lease.
+    """
+
+    def __init__(self, tenure: HeldRow) -> None:
+        self._lease = tenure.lease
+        self._line = Line(tenure)
+        self._stopped = threading.Event()
+        self._failure: Exception | None = None
+        self._failed: Callable[[Exception], None] | None = None
+        self._thread = threading.Thread(target=self._renew_on, name="enact-lease", daemon=True)
+        self._thread.start()
+
+    def on_failure(self, failed: Callable[[Exception], None]) -> None:
+        """Call `failed`, once, when another process has the shard or the database warned."""
+        self._failed = failed
+        if self._failure is not None:
+            failed(self._failure)
+
+    def check(self) -> None:
+        """Raise what ended the renewals, if anything did."""
+        if self._failure is not None:
+            raise self._failure
+
+    def end_soon(self) -> None:
+        """Let a renewal that cannot reach the database fail soon; from any thread."""
+        self._line.end_soon()
+
+    def close(self) -> None:
+        """End the renewals; idempotent."""
+        self._stopped.set()
+        self._line.end_soon()
+        if threading.current_thread() is not self._thread:
+            self._thread.join()
+        self._line.close()
+
+    def _renew_on(self) -> None:
+        lease = self._lease
+        try:
+            while not self._stopped.is_set():
+                # A batch renews as well, so only an idle store comes here.
+                due_s = lease.left_s - lease.usable_s + RENEW_S
+                if due_s <= 0:
+                    self._line.renew()
+                self._stopped.wait(max(due_s, 0.01) if due_s > 0 else RENEW_S)
+        except Exception as failure:  # noqa: BLE001 - the store must not go on without a lease
+            if not self._stopped.is_set():
+                self._failure = failure
+                if self._failed is not None:
+                    self._failed(failure)

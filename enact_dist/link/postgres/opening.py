@@ -1,0 +1,149 @@
+"""Takes a shard in a database over, and reads it.
+
+First the fence, in a short transaction: the new epoch, confirmed by the standby, and with it all
+that stands before it in the database's log.  So whatever is read afterwards cannot be lost by a
+failover, and no other process writes it.  The lease is renewed while rows are read.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from psycopg.types.numeric import Int8
+
+from enact_dist.errors import StoreError
+from enact_dist.link.folder.folder import refuse
+from enact_dist.link.lease import Lease
+from enact_dist.link.postgres.address import SeenRow, ShardHeldError
+from enact_dist.link.postgres.bodies import ReadBodies
+from enact_dist.link.postgres.connection import CONFIRMED, Connector, myself
+from enact_dist.link.postgres.line import HeldRow, Renewer
+from enact_dist.link.postgres.medium import PostgresMedium, database_errors
+from enact_dist.link.postgres.tables import BODIES, FENCE, ROWS, make_tables, state_of_shard
+from enact_dist.link.store.database import DatabaseRow
+from enact_dist.link.store.recovery import put_together, read_blobs, read_contents
+from enact_dist.link.store.store import Store
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from enact_dist.core.protocol.records import Recovered
+    from enact_dist.link.postgres.address import FreeShard, StoreAddress
+    from enact_dist.link.postgres.connection import DatabaseSession
+    from enact_dist.link.store.recovery import Contents
+
+
+def connector_of(address: StoreAddress) -> Connector:
+    """Return what connects to the database of a shard."""
+    return Connector(address.url, f"enact {address.cell} {address.shard} on {myself()}")
+
+
+def look(session: DatabaseSession, address: StoreAddress) -> tuple[int, SeenRow]:
+    """Return a shard's row and who holds it; make the row and the tables if they are missing.
+
+    Raises:
+        StoreError: The tables are of another format.
+        psycopg.Error: As the database reports it.
+    """
+    make_tables(session, address.cell, address.shard)
+    return _row(session, address)[:2]
+
+
+def _row(
+    session: DatabaseSession, address: StoreAddress, more: str = ""
+) -> tuple[int, SeenRow, int]:
+    """Return the id of a shard's row, who holds it, and the number of its newest batch."""
+    statement, values = state_of_shard(address.cell, address.shard)
+    found = session.row(statement + more, values)
+    if found is None:
+        raise StoreError(f"{address} has gone from the database", path=str(address))
+    shard, _, epoch, batch, beat, holder = found
+    return shard, SeenRow(epoch, beat, holder), batch
+
+
+def open_database(free: FreeShard, *, unix_s: int) -> tuple[Store, Recovered]:
+    """Take a shard over, in a new epoch, and read and check it (see `link.store.recovery`).
+
+    Args:
+        free: The shard, and its row when it was found free.
+        unix_s: The wall clock, seconds since 1970; the epoch is this or one more than the last.
+
+    Returns:
+        The store and its content.
+
+    Raises:
+        ShardHeldError: Another process was first, or its holder lives.
+        StoreError: The database cannot be used, or what it holds is damaged.
+    """
+    address, seen = free
+    name = str(address)
+    with database_errors(name):
+        session = (connector := connector_of(address)).connect()
+        try:
+            lease = Lease(address.lease_s)
+            sent_s = lease.now_s()
+            shard, epoch, batch = _fence(session, address, unix_s, seen)
+            lease.confirmed(sent_s)
+            medium = _medium(session, HeldRow(connector, shard, epoch, lease, name))
+        except BaseException:
+            session.close()
+            raise
+        try:
+            contents = _read(session, shard, name)
+            if contents.batch != batch:
+                refuse(
+                    name, f"is damaged: its newest row is of batch {contents.batch}, not {batch}"
+                )
+            contents.recovered.epoch = epoch
+            store = Store(medium, contents, wall_ns=unix_s * 1_000_000_000)
+        except BaseException:
+            medium.close()
+            raise
+    return store, contents.recovered
+
+
+def _medium(session: DatabaseSession, tenure: HeldRow) -> PostgresMedium:
+    return PostgresMedium(tenure, session, Renewer(tenure))
+
+
+def _fence(
+    session: DatabaseSession, address: StoreAddress, unix_s: int, seen: SeenRow
+) -> tuple[int, int, int]:
+    """Begin a new epoch; return the shard's row, the epoch, and the number of the newest batch."""
+    session.commit_as(CONFIRMED)
+    with session.connection.transaction():
+        shard, now, batch = _row(session, address, " FOR UPDATE")
+        if now[:2] != seen[:2]:
+            raise ShardHeldError(
+                f"{address} is served by process {now.holder or 'unknown'} in epoch {now.epoch}",
+                path=str(address),
+            )
+        epoch = max(now.epoch + 1, unix_s)
+        session.row(FENCE, (Int8(epoch), myself(), shard))
+    session.check()
+    return shard, epoch, batch
+
+
+class _Rows:
+    """Gives rows to `read_contents`, a few at a time."""
+
+    def __init__(self, session: DatabaseSession, shard: int) -> None:
+        self._session, self._shard = session, shard
+
+    def rows(self) -> Iterator[DatabaseRow]:
+        """Yield all rows, oldest identity first."""
+        yield from map(DatabaseRow._make, _streamed(self._session, ROWS, self._shard))
+
+
+def _streamed(session: DatabaseSession, statement: str, shard: int) -> Iterator[tuple[Any, ...]]:
+    with session.connection.cursor(binary=True) as cursor:
+        yield from cursor.stream(statement.encode(), (shard,))
+
+
+def _read(session: DatabaseSession, shard: int, name: str) -> Contents:
+    """Read and check all rows and bodies of a shard."""
+    contents = read_contents(_Rows(session, shard), name)
+    bodies = ReadBodies(name, _streamed(session, BODIES, shard))
+    read_blobs(contents, bodies, power_cut=False)
+    put_together(contents, name)
+    return contents

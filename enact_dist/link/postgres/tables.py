@@ -1,0 +1,127 @@
+"""The tables of the shards of a database, and the statements that write them.
+
+One row of `shard` per shard decides who may write: each batch, and each renewal of a lease, updates
+it on condition of the epoch, or writes nothing.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.errors import StoreError
+
+if TYPE_CHECKING:
+    from enact_dist.link.postgres.connection import DatabaseSession
+
+FORMAT: Final = 1
+"""Format of the tables; the rows in them have that of `link.folder.lock`."""
+_MAKE: Final = """
+CREATE SCHEMA IF NOT EXISTS enact;
+CREATE TABLE IF NOT EXISTS enact.shard (
+    id int GENERATED ALWAYS AS IDENTITY UNIQUE, cell text NOT NULL, name text NOT NULL,
+    format int NOT NULL, epoch bigint NOT NULL, batch bigint NOT NULL, beat bigint NOT NULL,
+    holder text NOT NULL, PRIMARY KEY (cell, name)
+) WITH (fillfactor = 10, autovacuum_vacuum_scale_factor = 0.02);
+CREATE TABLE IF NOT EXISTS enact.record (
+    shard int NOT NULL, id bigint NOT NULL, kind smallint NOT NULL, batch bigint NOT NULL,
+    key bytea NOT NULL, body bytea NOT NULL, crc bigint NOT NULL, PRIMARY KEY (shard, id)
+) WITH (fillfactor = 60, autovacuum_vacuum_scale_factor = 0.02);
+CREATE TABLE IF NOT EXISTS enact.body (
+    shard int NOT NULL, name text NOT NULL, part int NOT NULL, data bytea NOT NULL,
+    PRIMARY KEY (shard, name, part)
+) WITH (autovacuum_vacuum_scale_factor = 0.02);
+ALTER TABLE enact.record ALTER body SET STORAGE EXTERNAL;
+ALTER TABLE enact.body ALTER data SET STORAGE EXTERNAL;
+"""
+MISSING: Final = """
+SELECT array_agg(name) FROM unnest(ARRAY['enact.shard', 'enact.record', 'enact.body']) AS name
+WHERE to_regclass(name) IS NULL
+"""
+"""Names the tables that are not there."""
+STATE: Final = "SELECT id, format, epoch, batch, beat, holder FROM enact.shard"
+_ONE: Final = " WHERE cell = %b AND name = %b"
+FENCE: Final = """
+UPDATE enact.shard SET epoch = %b, beat = beat + 1, holder = %b WHERE id = %b RETURNING epoch
+"""
+RENEW: Final = "UPDATE enact.shard SET beat = beat + 1 WHERE id = %b AND epoch = %b RETURNING beat"
+RESIGN: Final = """
+UPDATE enact.shard SET beat = beat + 1, holder = '' WHERE id = %b AND epoch = %b RETURNING beat
+"""
+REACHED: Final = "SELECT epoch, batch FROM enact.shard WHERE id = %b"
+WRITE: Final = """
+WITH fence AS (
+    UPDATE enact.shard SET batch = %b, beat = beat + 1
+    WHERE id = %b AND epoch = %b AND batch = %b RETURNING id
+), gone AS (
+    DELETE FROM enact.record USING fence
+    WHERE record.shard = fence.id AND record.id = ANY(%b::bigint[])
+), unnamed AS (
+    DELETE FROM enact.body USING fence
+    WHERE body.shard = fence.id AND body.name = ANY(%b::text[])
+), put AS (
+    INSERT INTO enact.record
+    SELECT fence.id, r.* FROM fence, unnest(
+        %b::bigint[], %b::bigint[], %b::bigint[], %b::bytea[], %b::bytea[], %b::bigint[]
+    ) AS r
+    ON CONFLICT (shard, id) DO UPDATE SET kind = excluded.kind, batch = excluded.batch,
+        key = excluded.key, body = excluded.body, crc = excluded.crc
+)
+SELECT 1 / count(*) FROM fence
+"""
+"""A batch.  Without its row of the fence it divides by zero, which undoes the transaction."""
+PUT_BODY: Final = """
+INSERT INTO enact.body SELECT %b, %b, %b + r.part, r.data
+FROM unnest(%b::bytea[]) WITH ORDINALITY AS r(data, part)
+"""
+ROWS: Final = """
+SELECT id, kind, batch, key, body, crc FROM enact.record WHERE shard = %b ORDER BY id
+"""
+BODIES: Final = "SELECT name, data FROM enact.body WHERE shard = %b ORDER BY name, part"
+COPIES: Final = """
+SELECT application_name, sync_state, state FROM pg_stat_replication ORDER BY application_name
+"""
+SHARDS: Final = "SELECT id, name, epoch, batch, holder FROM enact.shard WHERE cell = %s"
+NAME_ME: Final = "SELECT set_config('application_name', %s, false)"
+STANDBYS: Final = """
+SELECT application_name FROM pg_stat_activity WHERE application_name LIKE 'enact-standby/%/%'
+ORDER BY backend_start
+"""
+
+
+def name_of_standby(shard: int, who: str) -> str:
+    """Return the name under which a standby's connection stands in `STANDBYS`."""
+    return f"enact-standby/{shard}/{who}"
+
+
+def state_of_shard(cell: str, shard: str) -> tuple[str, tuple[str, str]]:
+    """Return the statement that reads a shard's row, and its values."""
+    return STATE + _ONE, (cell, shard)
+
+
+def make_tables(session: DatabaseSession, cell: str, shard: str) -> None:
+    """Make the tables and the shard's row, unless they are there.
+
+    Raises:
+        StoreError: The tables are of another format.
+        psycopg.Error: As the database reports it; this user may not make them.
+    """
+    connection = session.connection
+    missing = session.row(MISSING)
+    statement, values = state_of_shard(cell, shard)
+    found = session.row(statement, values) if missing == (None,) else None
+    if found is None:
+        with connection.transaction():
+            connection.execute("SELECT pg_advisory_xact_lock(4711)")
+            if missing != (None,):
+                connection.execute(_MAKE, prepare=False)
+            connection.execute(
+                "INSERT INTO enact.shard (cell, name, format, epoch, batch, beat, holder)"
+                " VALUES (%s, %s, %s, 0, 0, 0, '') ON CONFLICT DO NOTHING",
+                (cell, shard, FORMAT),
+            )
+        session.check()
+    elif found[1] != FORMAT:
+        raise StoreError(
+            f"the tables of shard {shard} have format {found[1]}, this program reads {FORMAT}:"
+            " start the version of enact-dist that wrote them"
+        )
