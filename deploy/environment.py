@@ -124,7 +124,11 @@ def prepare(*, tests: bool) -> Path:
         return PYTHON
     if not PYTHON.exists():
         make_venv()
-    wanted = ["-e", f"{ROOT}[actors,workcell,record,keys,view,postgres]", *(dev_tools() if tests else [])]
+    wanted = [
+        "-e",
+        f"{ROOT}[actors,workcell,record,keys,view,postgres]",
+        *(dev_tools() if tests else []),
+    ]
     say("installing packages (some 700 MB, once)")
     pip = [str(PYTHON), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
     done = subprocess.run([*pip, *wanted], check=False, cwd=ROOT)

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     import zenoh
 
     from enact_dist.core.protocol.messages import Answer
-    from enact_dist.link.daemon.metrics import MetricsServer
+    from enact_dist.link.daemon.metrics import MetricsServer, Shown
     from enact_dist.link.host import ShardHost
     from enact_dist.link.postgres.address import FreeShard
     from enact_dist.link.zenoh.tls import Certificate
@@ -76,6 +76,7 @@ class RunningShard:
         settings: The settings of the shard.
         free: The shard in a database that it takes over, in place of a folder.
         session: The Zenoh session that serves it, which clients know already; None: a new one.
+        metrics: A server that shows this shard from now on; None: a new one, if one is wanted.
     """
 
     def __init__(
@@ -83,6 +84,7 @@ class RunningShard:
         settings: DaemonSettings,
         free: FreeShard | None = None,
         session: zenoh.Session | None = None,
+        metrics: MetricsServer | None = None,
     ) -> None:
         self.settings = settings
         self._ended = threading.Event()
@@ -108,9 +110,9 @@ class RunningShard:
             if self._shared is not None and settings.carrier != "zenoh":
                 self._sockets = SocketService(self.host, self._shared)
                 undo.callback(self._sockets.close)
-            self._metrics: MetricsServer | None = None
-            if settings.metrics is not None:
-                self._metrics = _metrics_server(settings, self.host)
+            self._metrics = metrics
+            if metrics is None and settings.metrics is not None:
+                self._metrics = _metrics_server(settings, self._shown())
                 undo.callback(self._metrics.close)
             self._names = settings.common_names
             self._session = session or self._open_session()
@@ -136,7 +138,14 @@ class RunningShard:
             self.reload: Reload | None = None
             if settings.keys is not None or settings.shard.rights is not None:
                 self.reload = Reload(self._take_again, self.host.count, settings.keys)
+            if metrics is not None:
+                metrics.show(self._shown())
             undo.pop_all()
+
+    def _shown(self) -> Shown:
+        from enact_dist.link.daemon.metrics import shown_of
+
+        return shown_of(self.host, self.settings.cell)
 
     def _has_failed(self, failure: Exception) -> None:
         if isinstance(failure, ShardTakenError):
@@ -300,11 +309,11 @@ def _session_of(settings: DaemonSettings, names: Mapping[str, str] | None) -> ze
     )
 
 
-def _metrics_server(settings: DaemonSettings, host: ShardHost) -> MetricsServer:
-    from enact_dist.link.daemon.metrics import MetricsServer, shown_of
+def _metrics_server(settings: DaemonSettings, shown: Shown) -> MetricsServer:
+    from enact_dist.link.daemon.metrics import MetricsServer
 
     assert settings.metrics is not None
-    return MetricsServer(settings.metrics, shown_of(host, settings.cell))
+    return MetricsServer(settings.metrics, shown)
 
 
 def _shared_folder(settings: DaemonSettings) -> SharedFolder | None:
@@ -361,22 +370,34 @@ def take_shard(
     """
     assert settings.store is not None
     require_driver(settings.store.url)
+    from enact_dist.link.daemon.metrics import StandbyProbes
     from enact_dist.link.postgres.standby import wait_free
 
     _check(settings)
     name, patient = settings.shard.name, settings.standby
+    probes = StandbyProbes(settings)
+
+    def looked(answered: bool) -> None:
+        probes.looked(answered)
+        waiting()
+
     with ExitStack() as undo:
         session = _session_of(settings, settings.common_names)
         undo.callback(close_session, session)
+        metrics = None
+        if settings.metrics is not None:
+            metrics = _metrics_server(settings, probes.shown())
+            undo.callback(metrics.close)
         while free := wait_free(
             settings.store,
             stopped=stopped,
             patient=patient,
             note=lambda text: _log.info("shard %s stands by: %s", name, text),
-            looked=waiting,
+            looked=looked,
         ):
+            probes.takes()
             try:
-                shard = RunningShard(settings, free, session)
+                shard = RunningShard(settings, free, session, metrics)
             except StoreError as error:
                 if not patient:
                     raise

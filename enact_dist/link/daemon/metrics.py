@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from enact_dist.core.state.clock import Latencies
+    from enact_dist.link.daemon.settings import DaemonSettings
     from enact_dist.link.host import ShardHost
 
 READERS_MAX: Final = 8
@@ -41,6 +42,8 @@ READ_S: Final = 5.0
 PATH: Final = "/metrics"
 ALIVE_S: Final = 20.0
 """How long a dispatcher may stand still, as in the unit of systemd."""
+SEES_S: Final = 5.0
+"""How long a daemon that stands by sees its database after a look at it."""
 POLL_S: Final = 0.1
 """How long `close` may wait for the thread that accepts."""
 PAUSE_S_MIN: Final = 0.05
@@ -59,7 +62,7 @@ class Pulse:
 
     def __init__(self, for_s: float) -> None:
         self._for_s = for_s
-        self.beat()
+        self._until_s = 0.0
 
     def beat(self) -> None:
         """Note that it happens now."""
@@ -227,9 +230,49 @@ METRICS: Final = tuple(
 def shown_of(host: ShardHost, cell: str) -> Shown:
     """Return what a running shard shows."""
     alive = Pulse(ALIVE_S)
+    alive.beat()
     host.each_tick(alive.beat)
     ready = lambda: bool(host.figures()["ready"])  # noqa: E731 - one of four
     return Shown(lambda: page(host, cell), alive, ready, host.count)
+
+
+class StandbyProbes:
+    """What a daemon shows while it stands by, and while it reads the shard that it has taken over.
+
+    Args:
+        settings: The settings of its shard, with an address for metrics.
+    """
+
+    def __init__(self, settings: DaemonSettings) -> None:
+        self._alive, self._sees = Pulse(ALIVE_S), Pulse(SEES_S)
+        self._alive.beat()
+        self._takes = False
+        labels = _labels(settings.cell, settings.shard.name)
+        self._page = "".join(
+            f"# HELP {one.name} {one.meaning}\n# TYPE {one.name} gauge\n{one.name}{{{labels}}} 1\n"
+            for one in METRICS
+            if one.figure == "standby"
+        )
+
+    def shown(self) -> Shown:
+        """Return it for a server."""
+        return Shown(
+            page=lambda: self._page,
+            alive=lambda: self._takes or self._alive(),
+            ready=lambda: not self._takes and self._sees(),
+            count=lambda _: None,
+        )
+
+    def looked(self, answered: bool) -> None:
+        """Note a look at the shard's row, and whether the database answered."""
+        self._takes = False
+        self._alive.beat()
+        if answered:
+            self._sees.beat()
+
+    def takes(self) -> None:
+        """Note that the shard is taken over now, which takes as long as it takes to read it."""
+        self._takes = True
 
 
 def page(host: ShardHost, cell: str) -> str:
