@@ -140,7 +140,7 @@ class ShardHost:
         if store is None:
             shard.keep_nothing()
         self._store_thread = self._start_store(store) if store is not None else None
-        self._silence = Silence.of(store, self.count, self._fail)
+        self.silence = Silence.of(store, self.count, self._fail)
         self._stalls = Stalls(self.name, self.count)
         self._timer = threading.Thread(target=self._keep_time, name="enact-timer", daemon=True)
         self._timer.start()
@@ -207,7 +207,7 @@ class ShardHost:
         kind = type(message)
         if kind is Commit or kind is Prepare:
             commit: Commit = message  # type: ignore[assignment]  # as just found
-            if self._silence and (too_large := self._silence.too_large(commit, self._shard.state)):
+            if self.silence and (too_large := self.silence.too_large(commit, self._shard.state)):
                 reply(too_large)
                 return
             if names_payloads(commit) and self._refusal(commit, identity) is None:
@@ -352,7 +352,7 @@ class ShardHost:
                 now_ns=clock.monotonic_ns(),
                 wall_ns=clock.wall_ns(),
             )
-            for effect in self._silence.passing(effects) if self._silence else effects:
+            for effect in self.silence.passing(effects) if self.silence else effects:
                 if isinstance(effect, Reply):  # answers first, since clients wait for them
                     reply = self._replies.pop(effect.reply_to, None)
                     if reply is not None:
@@ -481,8 +481,8 @@ class ShardHost:
 
     def close(self) -> None:
         """Store all pending records, then end; idempotent."""
-        if self._silence is not None:
-            self._silence.end_soon()
+        if self.silence is not None:
+            self.silence.end_soon()
         if self._store_thread is not None:
             self._store_thread.close()
         with self._mutex:

@@ -111,6 +111,16 @@ class Silence:
         self._kept: list[Effect] = []
         self._silent = False
 
+    @property
+    def holds(self) -> bool:
+        """Whether answers go out."""
+        return self._lease.holds
+
+    @property
+    def left_s(self) -> float:
+        """How long answers go out without a further confirmation; below 0: they wait."""
+        return self._lease.left_s
+
     @classmethod
     def of(
         cls,

@@ -135,6 +135,15 @@ def say(formatter: logging.Formatter, event: str, text: str, **fields: object) -
     sys.stdout.flush()
 
 
+def last_words(formatter: logging.Formatter, text: str) -> None:
+    """Write a grave line past the log's queue, for a process that exits in the next moment."""
+    levels = {"levelno": logging.CRITICAL, "levelname": "CRITICAL"}
+    line = formatter.format(logging.makeLogRecord({"name": "enact.shard", "msg": text, **levels}))
+    with suppress(OSError):  # what its reader cannot take now is lost
+        os.set_blocking(STDERR, False)
+        os.write(STDERR, f"{line}\n".encode("utf-8", "backslashreplace"))
+
+
 def says_ready(line: str) -> bool:
     """Whether this line, text or object, reports that a shard or an actor is ready."""
     return in_words(line).startswith(READY)

@@ -28,13 +28,14 @@ class ReplicatedCell:
         self.folder = folder
         self.url = url
         self.places = (free_endpoint(), free_endpoint())
-        self.daemons = {}
+        self.daemons = []
         self._environment = without_overrides(environment)
         self.file = folder / "cell.toml"
         both = ", ".join(f'"{place}"' for place in self.places)
+        first = self.places[0]
         self.file.write_text(
             f'name = "{name}"\nworlds = ["online"]\nstore = "{url}"\nlease_s = {lease_s}\n'
-            f"[shards.{SHARD}]\nlisten = [{both}]\nadvertise = [{both}]\n"
+            f'[shards.{SHARD}]\nlisten = "{first}"\nadvertise = [{both}]\n'
         )
 
     def log(self, place):
@@ -47,12 +48,12 @@ class ReplicatedCell:
         daemon = LineProcess(
             "enact_dist.cli.main", words, self.log(place), environment=self._environment
         )
-        self.daemons[place] = daemon
+        self.daemons.append(daemon)
         daemon.expect(says)
         return daemon
 
     def end(self):
-        for daemon in self.daemons.values():
+        for daemon in self.daemons:
             daemon.end()
 
 

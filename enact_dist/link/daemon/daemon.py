@@ -33,8 +33,9 @@ from enact_dist.link.daemon.second_daemon import refuse_second_daemon
 from enact_dist.link.daemon.service_manager import ServiceManager
 from enact_dist.link.daemon.settings import DRAIN_S, DaemonSettings
 from enact_dist.link.daemon.shard_calls import ShardCalls
+from enact_dist.link.daemon.successor import Successor
 from enact_dist.link.lease import ShardTakenError
-from enact_dist.link.log import READY, JsonLines, Log, TextLines, say
+from enact_dist.link.log import READY, JsonLines, Log, TextLines, last_words, say
 from enact_dist.link.memory.shared_folder import SharedFolder
 from enact_dist.link.opening import open_host
 from enact_dist.link.postgres.address import require_driver
@@ -135,6 +136,10 @@ class RunningShard:
             for other in self._calls.others:  # the first tick's requests to them were not sent
                 self.host.event(ShardReturned(other))
             undo.callback(self._service.close)
+            self._successor: Successor | None = None
+            if self.host.silence is not None:
+                self._successor = Successor(self.host, settings, self._has_failed)
+                undo.callback(self._successor.close)
             self.reload: Reload | None = None
             if settings.keys is not None or settings.shard.rights is not None:
                 self.reload = Reload(self._take_again, self.host.count, settings.keys)
@@ -150,7 +155,7 @@ class RunningShard:
     def _has_failed(self, failure: Exception) -> None:
         if isinstance(failure, ShardTakenError):
             # Another process serves the shard: whatever is still in this one must not leave it.
-            logging.shutdown()
+            last_words(_formatter(self.settings), f"this process ends at once: {failure}")
             os._exit(1)
         self._ended.set()
 
@@ -248,6 +253,8 @@ class RunningShard:
             if self._stopped:
                 return
             self._stopped = True
+            if self._successor is not None:
+                self._successor.close()
             self.host.drain()
             if not self.host.wait_idle(drain_s):
                 self._name_holders(drain_s)
