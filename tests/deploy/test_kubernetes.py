@@ -115,7 +115,7 @@ def test_pods_of_a_shard_are_where_the_cell_expects_them(shard, cell):
     assert there.listen == (f"tcp/0.0.0.0:{opened[port['targetPort']]}",)
     assert opened[port["targetPort"]] == port["port"]  # a headless service translates no port
     assert shard["spec"]["serviceName"] == service["metadata"]["name"]
-    assert command_of(shard).metrics == ("0.0.0.0", opened["metrics"])
+    assert command_of(shard).metrics == f"0.0.0.0:{opened['metrics']}"
 
 
 @pytest.mark.parametrize("shard", SHARDS, ids=name_of)
