@@ -116,11 +116,6 @@ class Silence:
         """Whether answers go out."""
         return self._lease.holds
 
-    @property
-    def left_s(self) -> float:
-        """How long answers go out without a further confirmation; below 0: they wait."""
-        return self._lease.left_s
-
     @classmethod
     def of(
         cls,

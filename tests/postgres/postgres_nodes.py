@@ -39,7 +39,7 @@ def why_missing():
     try:
         import psycopg  # noqa: F401
     except ImportError as error:
-        return f"psycopg cannot be imported ({error}): pip install 'enact-dist[postgres]'"
+        return f"psycopg cannot be imported ({error}): pip install -e '.[postgres]'"
     if programs() is None:
         return "no PostgreSQL server is installed: apt-get install postgresql"
     if os.geteuid() == 0 and shutil.which("runuser") is None:

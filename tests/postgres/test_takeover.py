@@ -158,6 +158,3 @@ def test_commands_say_what_the_database_knows(cell, pair, capsys, monkeypatch):
 
     assert main(["shard", "check", *words]) == 3
     assert "holds it in its database" in capsys.readouterr().out
-    for verb in (["backup", SHARD, "--to", "x"], ["restore", SHARD, "--from", "x"]):
-        assert main(["shard", *verb, *words]) == 2
-        assert "pg_dump" in capsys.readouterr().err

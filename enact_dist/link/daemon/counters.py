@@ -151,6 +151,14 @@ OF_A_SHARD: Final[dict[str, Figure]] = {
         "disk writes that took more than a second",
         "move the shard's folder to another disk; the shard's log gives the times",
     ),
+    "silences": Figure(
+        "times that answers waited, since the database had confirmed nothing for `lease_s`",
+        "look at the database and the way to it: enact doctor",
+    ),
+    "data_too_large": Figure(
+        "commits refused because a datum was larger than a database keeps",
+        "make the aspect volatile, or keep its shard in a folder",
+    ),
     "overloads": Figure(
         "requests refused because too many wait", "find their clients: enact lock ls"
     ),

@@ -64,7 +64,7 @@ def require_driver(url: str) -> None:
     except ImportError as error:
         raise StoreError(
             f"the store {without_password(url)} needs psycopg, which cannot be imported ({error}):"
-            " pip install 'enact-dist[postgres]'"
+            " pip install -e '.[postgres]' in the clone of enact-dist"
         ) from error
 
 

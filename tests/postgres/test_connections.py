@@ -1,0 +1,49 @@
+"""Which host a store connects to, and what each class of durability asks of the database."""
+
+import pytest
+from ports import free_port
+from shard_stores import address_of, state
+
+from enact_dist.link.postgres.connection import Connector
+from enact_dist.terms import Durability
+
+
+@pytest.mark.parametrize(
+    ("durability", "asked"), [(Durability.DURABLE, "on"), (Durability.OS, "remote_write")]
+)
+def test_a_commit_is_confirmed_as_its_aspect_asks(server, stores, durability, asked):
+    """Never less than what the other host's system has got: that would be lost with a failover."""
+    store, _, medium = stores.open(address_of(server.url))
+    store.write([state(1, durability=durability)])
+    found = medium.line._session.connection.execute("SHOW synchronous_commit").fetchone()
+    assert found == (asked,)
+
+
+def test_the_host_that_answered_last_is_asked_first(server):
+    """A dead host costs its time once, not at each reconnection."""
+    dead = free_port()
+    url = f"postgresql://postgres@127.0.0.1:{dead},127.0.0.1:{server.port}/postgres"
+    connector = Connector(url, "test")
+    assert connector._ports == [str(dead), str(server.port)]
+    session = connector.connect()
+    session.close()
+    assert connector._ports == [str(server.port), str(dead)]
+    assert connector._hosts == ["127.0.0.1", "127.0.0.1"]
+
+
+def test_nothing_of_ours_cancels_a_wait_for_the_standby(server):
+    """Whatever the role or the address says: a cancelled wait would be taken for a success."""
+    url = server.url + "?options=-c%20statement_timeout%3D1000%20-c%20work_mem%3D8MB"
+    session = Connector(url, "test").connect()
+    try:
+        shown = {
+            name: session.row(f"SHOW {name}")[0]
+            for name in ("statement_timeout", "work_mem", "client_min_messages")
+        }
+    finally:
+        session.close()
+    assert shown == {
+        "statement_timeout": "0",
+        "work_mem": "8MB",
+        "client_min_messages": "warning",
+    }
