@@ -85,6 +85,24 @@ def test_an_old_daemon_writes_nothing(server, stores):
         assert versions(recovered) == {"a": 3}
 
 
+def test_an_old_daemon_writes_nothing_once_another_has_begun(server, stores):
+    """The epoch alone keeps it out, before the new daemon has written its first batch."""
+    address = address_of(server.url)
+    old, _, medium = stores.open(address)
+    old.write([state(1)])
+    medium._renewer.close()
+    server.execute("UPDATE enact.shard SET epoch = epoch + 1 WHERE name = %s", (address.shard,))
+    before = row_of(server, address)
+
+    with pytest.raises(ShardTakenError):
+        old.write([state(2, body=bytes(70_000))])
+
+    assert row_of(server, address) == before
+    assert (
+        server.execute("SELECT 1 FROM enact.body WHERE shard = %s", (medium._tenure.shard,)) == []
+    )
+
+
 def test_a_renewal_notices_another_holder(server, stores):
     """An idle daemon that was overtaken ends, too."""
     address = address_of(server.url)

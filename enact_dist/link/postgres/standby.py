@@ -2,8 +2,8 @@
 
 A holder changes its row's beat at least every 0.4 s.  Who waits counts the lease, and the drift of
 two clocks, from when it *saw* a beat, by its own monotonic clock: that is later than when the
-holder sent it.  After each new connection it counts anew, with time for the holder to connect
-again: while the database was away, no beat could change.
+holder sent it.  After each new connection, and each look that took long, it counts anew, with time
+for the holder to connect again: while the database was away, no beat could change.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ class BeatWatch:
 
     def __init__(self, lease_s: float) -> None:
         self._lease_s = lease_s
-        self._wait_s = lease_s * (1 + DRIFT)
+        self._wait_s = lease_s * (1 + DRIFT)  # longer after an outage, until the holder is seen
         self._seen: SeenRow | None = None
         self._since_s = 0.0
         self.alive = False
 
-    def reconnected(self) -> None:
-        """Count anew: the database was away."""
+    def was_away(self) -> None:
+        """Count anew: the database did not answer."""
         self._seen = None
         self._wait_s = (self._lease_s + RETURN_S) * (1 + DRIFT)
 
@@ -55,6 +55,8 @@ class BeatWatch:
         before = self._seen
         if before is None or before[:2] != seen[:2]:
             self.alive = before is not None
+            if self.alive:
+                self._wait_s = self._lease_s * (1 + DRIFT)
             self._seen, self._since_s = seen, now_s
         return not seen.holder or now_s - self._since_s > self._wait_s
 
@@ -90,7 +92,10 @@ def wait_free(
             try:
                 if session is None:
                     session, told = connector.connect(), False
+                began_s = time.monotonic()
                 shard, seen = look(session, address)
+                if time.monotonic() - began_s > address.lease_s / 2:
+                    watch.was_away()
                 if not told and seen.holder:
                     told = True
                     session.row(NAME_ME, (name_of_standby(shard, myself()),))
@@ -111,7 +116,7 @@ def wait_free(
                 if session is not None:
                     session.close()
                     session = None
-                watch.reconnected()
+                watch.was_away()
                 found = f"{address} cannot be reached: {in_one_line(failure)}"
             if found != noted:
                 note(found)
