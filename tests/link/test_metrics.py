@@ -22,8 +22,8 @@ from enact_dist.link.daemon.metrics import (
     CONTENT_TYPE,
     METRICS,
     MetricsServer,
-    Shown,
-    shown_of,
+    MetricsSource,
+    source_of,
     table,
 )
 from enact_dist.link.opening import open_host
@@ -60,7 +60,7 @@ def peer(host, make_peer):
 @pytest.fixture
 def served(host):
     """Ask a real server for the metrics: `served()` returns its text."""
-    server = MetricsServer(("127.0.0.1", 0), shown_of(host, 'cell "a"'))
+    server = MetricsServer(("127.0.0.1", 0), source_of(host, 'cell "a"'))
 
     def ask(path="/metrics"):
         with DIRECT.open(f"http://127.0.0.1:{server.port}{path}", timeout=30) as answer:
@@ -202,7 +202,7 @@ def test_address_in_use_is_named():
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         with pytest.raises(LinkError, match=rf"127.0.0.1:{port}: Address already in use; name"):
-            MetricsServer(("127.0.0.1", port), Shown(str, bool, bool, print))
+            MetricsServer(("127.0.0.1", port), MetricsSource(str, bool, bool, print))
 
 
 def probe(server, path):
@@ -230,13 +230,13 @@ def test_a_dispatcher_that_hangs_is_not_alive(host, monkeypatch):
     monkeypatch.setattr(host, "each_tick", ticks.append)
     monkeypatch.setattr(metrics.time, "monotonic", lambda: now_s)
     now_s = 100.0
-    shown = metrics.shown_of(host, "cell")
+    source = metrics.source_of(host, "cell")
     now_s += metrics.ALIVE_S - 0.1
-    assert shown.alive()
+    assert source.alive()
     now_s += 0.2
-    assert not shown.alive()
+    assert not source.alive()
     ticks[0]()
-    assert shown.alive()
+    assert source.alive()
 
 
 def test_readers_for_whom_there_was_no_thread_take_no_place(served, monkeypatch):

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     import zenoh
 
     from enact_dist.core.protocol.messages import Answer
-    from enact_dist.link.daemon.metrics import MetricsServer, Shown
+    from enact_dist.link.daemon.metrics import MetricsServer
     from enact_dist.link.host import ShardHost
     from enact_dist.link.postgres.address import FreeShard
     from enact_dist.link.zenoh.tls import Certificate
@@ -112,9 +112,15 @@ class RunningShard:
                 self._sockets = SocketService(self.host, self._shared)
                 undo.callback(self._sockets.close)
             self._metrics = metrics
-            if metrics is None and settings.metrics is not None:
-                self._metrics = _metrics_server(settings, self._shown())
-                undo.callback(self._metrics.close)
+            if settings.metrics is not None:
+                from enact_dist.link.daemon.metrics import MetricsServer, source_of
+
+                source = source_of(self.host, settings.cell)
+                if metrics is not None:
+                    metrics.show(source)
+                else:
+                    self._metrics = MetricsServer(settings.metrics, source)
+                    undo.callback(self._metrics.close)
             self._names = settings.common_names
             self._session = session or self._open_session()
             if session is None:
@@ -143,14 +149,7 @@ class RunningShard:
             self.reload: Reload | None = None
             if settings.keys is not None or settings.shard.rights is not None:
                 self.reload = Reload(self._take_again, self.host.count, settings.keys)
-            if metrics is not None:
-                metrics.show(self._shown())
             undo.pop_all()
-
-    def _shown(self) -> Shown:
-        from enact_dist.link.daemon.metrics import shown_of
-
-        return shown_of(self.host, self.settings.cell)
 
     def _has_failed(self, failure: Exception) -> None:
         if isinstance(failure, ShardTakenError):
@@ -316,13 +315,6 @@ def _session_of(settings: DaemonSettings, names: Mapping[str, str] | None) -> ze
     )
 
 
-def _metrics_server(settings: DaemonSettings, shown: Shown) -> MetricsServer:
-    from enact_dist.link.daemon.metrics import MetricsServer
-
-    assert settings.metrics is not None
-    return MetricsServer(settings.metrics, shown)
-
-
 def _shared_folder(settings: DaemonSettings) -> SharedFolder | None:
     """Make the folder that the shard shares with processes of this host.
 
@@ -377,7 +369,7 @@ def take_shard(
     """
     assert settings.store is not None
     require_driver(settings.store.url)
-    from enact_dist.link.daemon.metrics import StandbyProbes
+    from enact_dist.link.daemon.metrics import MetricsServer, StandbyProbes
     from enact_dist.link.postgres.standby import wait_free
 
     _check(settings)
@@ -393,7 +385,7 @@ def take_shard(
         undo.callback(close_session, session)
         metrics = None
         if settings.metrics is not None:
-            metrics = _metrics_server(settings, probes.shown())
+            metrics = MetricsServer(settings.metrics, probes.source())
             undo.callback(metrics.close)
         while free := wait_free(
             settings.store,

@@ -74,7 +74,7 @@ class Pulse:
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
+class MetricsSource:
     """What a server of metrics shows; called from its threads.
 
     Attributes:
@@ -95,7 +95,7 @@ class MetricsServer:
 
     Args:
         address: Host and port; port 0 takes any that is free.
-        shown: What it shows, until `show`.
+        source: What it shows, until `show`.
 
     Attributes:
         port: The port on which it listens.
@@ -104,10 +104,10 @@ class MetricsServer:
         LinkError: The address is in use, or not an address of this host.
     """
 
-    def __init__(self, address: tuple[str, int], shown: Shown) -> None:
+    def __init__(self, address: tuple[str, int], source: MetricsSource) -> None:
         host, port = address
         try:
-            self._server = _Server(address, shown)
+            self._server = _Server(address, source)
         except OSError as error:
             raise LinkError(
                 f"metrics cannot be served at {host}:{port}: {error.strerror or error}; name"
@@ -119,9 +119,9 @@ class MetricsServer:
         )
         self._thread.start()
 
-    def show(self, shown: Shown) -> None:
+    def show(self, source: MetricsSource) -> None:
         """Show something else from now on."""
-        self._server.shown = shown
+        self._server.source = source
 
     def close(self) -> None:
         """Stop listening; idempotent."""
@@ -136,9 +136,9 @@ class _Server(ThreadingMixIn, TCPServer):
     daemon_threads = True
     block_on_close = False
 
-    def __init__(self, address: tuple[str, int], shown: Shown) -> None:
+    def __init__(self, address: tuple[str, int], source: MetricsSource) -> None:
         self.address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
-        self.shown = shown
+        self.source = source
         self.ending = threading.Event()
         self._pause_s = 0.0
         self._room = threading.BoundedSemaphore(READERS_MAX)
@@ -151,7 +151,7 @@ class _Server(ThreadingMixIn, TCPServer):
         except OSError as error:
             if not self._pause_s:
                 _log.warning("cannot accept a reader of the metrics now: %s", error)
-            self.shown.count("metrics_readers_refused")
+            self.source.count("metrics_readers_refused")
             self._pause_s = min(max(2 * self._pause_s, PAUSE_S_MIN), PAUSE_S_MAX)
             self.ending.wait(self._pause_s)
             raise
@@ -160,14 +160,14 @@ class _Server(ThreadingMixIn, TCPServer):
 
     def process_request(self, request: Any, client_address: Any) -> None:
         if not self._room.acquire(blocking=False):
-            self.shown.count("metrics_readers_refused")
+            self.source.count("metrics_readers_refused")
             self.shutdown_request(request)
             return
         try:
             super().process_request(request, client_address)
         except BaseException:  # the system has no more threads
             self._room.release()
-            self.shown.count("metrics_readers_refused")
+            self.source.count("metrics_readers_refused")
             raise
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
@@ -187,14 +187,14 @@ class _Handler(BaseHTTPRequestHandler):
     server_version, sys_version = "enact", ""
 
     def do_GET(self) -> None:
-        shown = cast("_Server", self.server).shown
+        source = cast("_Server", self.server).source
         path = self.path.partition("?")[0]
-        probe = {"/alive": shown.alive, "/ready": shown.ready}.get(path)
+        probe = {"/alive": source.alive, "/ready": source.ready}.get(path)
         if probe is None and path != PATH:
             self.send_error(HTTPStatus.NOT_FOUND, f"this server has only {PATH}, /alive and /ready")
             return
         passed = probe is None or probe()
-        text = shown.page() if probe is None else f"{'yes' if passed else 'no'}\n"
+        text = source.page() if probe is None else f"{'yes' if passed else 'no'}\n"
         body = text.encode()
         self.send_response(HTTPStatus.OK if passed else HTTPStatus.SERVICE_UNAVAILABLE)
         self.send_header("Content-Type", CONTENT_TYPE)
@@ -227,13 +227,13 @@ METRICS: Final = tuple(
 """All metrics of a shard, in the order in which it serves them."""
 
 
-def shown_of(host: ShardHost, cell: str) -> Shown:
+def source_of(host: ShardHost, cell: str) -> MetricsSource:
     """Return what a running shard shows."""
     alive = Pulse(ALIVE_S)
     alive.beat()
     host.each_tick(alive.beat)
     ready = lambda: bool(host.figures()["ready"])  # noqa: E731 - one of four
-    return Shown(lambda: page(host, cell), alive, ready, host.count)
+    return MetricsSource(lambda: page(host, cell), alive, ready, host.count)
 
 
 class StandbyProbes:
@@ -254,9 +254,9 @@ class StandbyProbes:
             if one.figure == "standby"
         )
 
-    def shown(self) -> Shown:
+    def source(self) -> MetricsSource:
         """Return it for a server."""
-        return Shown(
+        return MetricsSource(
             page=lambda: self._page,
             alive=lambda: self._takes or self._alive(),
             ready=lambda: not self._takes and self._sees(),
