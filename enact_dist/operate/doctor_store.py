@@ -28,8 +28,8 @@ def database_of(config: CellConfig) -> DatabaseReport:
     return examine_database(config.store, config.name)
 
 
-def why_silent(config: CellConfig) -> Callable[[str], str]:
-    """Return what says of a shard that does not answer what the cell's database knows about it."""
+def holders(config: CellConfig) -> Callable[[str], str]:
+    """Return a function that says who serves a shard and who stands by, as the database has it."""
     try:
         found = database_of(config)
     except StoreError as error:

@@ -154,6 +154,8 @@ def test_commands_say_what_the_database_knows(cell, pair, capsys, monkeypatch):
     assert "second confirms each commit" in said
     assert f"store of {SHARD}" in said
     assert "stands by" in said
+    assert main(["shard", "ls", *words]) == 0
+    assert "holds it in its database" in capsys.readouterr().err
     cell.end()
 
     assert main(["shard", "check", *words]) == 3

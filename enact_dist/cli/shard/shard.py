@@ -111,6 +111,8 @@ def list_shards(options: argparse.Namespace) -> Output:
     status = DONE if all(shard.reachable for shard in shards) else UNREACHABLE
 
     def problems() -> None:
+        for line in _holders(options):
+            print(f"enact: {line}", file=sys.stderr)
         for shard in shards:
             if shard.problem:
                 print(f"enact: shard {shard.name}: {shard.problem}", file=sys.stderr)
@@ -122,6 +124,20 @@ def list_shards(options: argparse.Namespace) -> Output:
     if options.counters:
         return Output(shards, counters, status=status)
     return Output(shards, problems, rows=[*map(_row, shards)], status=status)
+
+
+def _holders(options: argparse.Namespace) -> list[str]:
+    """Return who serves and who stands by, in a cell whose data are in a database."""
+    from enact_dist.config.read import load_config
+
+    target = cell_target(options)
+    config = None if is_endpoint(target) else load_config(target)
+    if config is None or not config.store:
+        return []
+    from enact_dist.operate.doctor_store import holders
+
+    held = holders(config)
+    return [f"shard {shard.name}: {held(shard.name)}" for shard in config.shards]
 
 
 def _print_counters(shards: Sequence[ShardInfo]) -> None:
@@ -171,10 +187,10 @@ def _with_reasons(config: CellConfig, found: list[ShardHealth]) -> list[ShardHea
     """Return the shards with what the cell's database says of those that do not answer."""
     if not config.store or all(one.alive for one in found):
         return found
-    from enact_dist.operate.doctor_store import why_silent
+    from enact_dist.operate.doctor_store import holders
 
-    why = why_silent(config)
-    silent = {one.name: why(one.name) for one in found if not one.alive and not one.problem}
+    held = holders(config)
+    silent = {one.name: held(one.name) for one in found if not one.alive and not one.problem}
     return [replace(one, problem=silent.get(one.name, one.problem)) for one in found]
 
 

@@ -128,6 +128,16 @@ class DatabaseSession:
                 " shard again"
             )
 
+    def break_off(self) -> None:
+        """Let an act of another thread that waits for an answer fail.
+
+        The server does not learn of it before it answers, so this cancels no wait for a standby.
+        """
+        with suppress(OSError, psycopg.Error):
+            line = socket.socket(fileno=os.dup(self.connection.fileno()))
+            with line:
+                line.shutdown(socket.SHUT_RDWR)
+
     def close(self) -> None:
         """Close the connection; idempotent."""
         with suppress(psycopg.Error):

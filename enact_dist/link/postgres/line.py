@@ -61,13 +61,23 @@ class Line:
         self._session = session
         self._ending = threading.Event()
         self._ends_s: float | None = None
+        self._breaker: threading.Timer | None = None
         self._is_away = False
         self.reconnects = 0
 
     def end_soon(self) -> None:
-        """Let an act that cannot reach the database fail within `CLOSE_S`; from any thread."""
+        """Let an act without an answer fail after `CLOSE_S`; from any thread; idempotent."""
+        if self._ending.is_set():
+            return
         self._ends_s = self._tenure.lease.now_s() + CLOSE_S
         self._ending.set()
+        self._breaker = threading.Timer(CLOSE_S, self._break_off)
+        self._breaker.daemon = True
+        self._breaker.start()
+
+    def _break_off(self) -> None:
+        if (session := self._session) is not None:
+            session.break_off()
 
     def again(
         self, act: Callable[[DatabaseSession], None], done: Callable[[DatabaseSession], bool]
@@ -138,6 +148,11 @@ class Line:
 
     def close(self) -> None:
         """Close the connection; idempotent."""
+        if self._breaker is not None:
+            self._breaker.cancel()
+        self._drop()
+
+    def _drop(self) -> None:
         if self._session is not None:
             self._session.close()
             self._session = None
@@ -167,11 +182,11 @@ class Line:
         """
         if not is_lost(failure, self._session):
             raise failure
-        self.close()
+        self._drop()
         was_away, self._is_away = self._is_away, True
         if not was_away:
             _log.warning("%s cannot be reached; waiting for it: %s", self._tenure.name, failure)
-        if self._ends_s is not None and self._tenure.lease.now_s() > self._ends_s:
+        if self._ends_s is not None and self._tenure.lease.now_s() >= self._ends_s:
             raise StoreError(
                 f"{self._tenure.name} cannot be reached ({failure}), and the shard ends: what it"
                 " has not acknowledged may be lost",
