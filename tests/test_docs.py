@@ -43,6 +43,7 @@ FOLLOWED = {
     "own_actors.md",
     "protocol.md",
     "securing.md",
+    "surviving.md",
     "drills.md",
 }
 """Pages whose consoles are followed in `tests/e2e`."""

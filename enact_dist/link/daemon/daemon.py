@@ -78,6 +78,7 @@ class RunningShard:
         certificate: Its certificate; None: it has no keys.
         free: The shard in a database that it takes over, in place of a folder.
         session: The Zenoh session that serves it, which clients know already; None: a new one.
+        metrics: A server that shows this shard from now on; None: a new one, if one is wanted.
     """
 
     def __init__(
@@ -86,6 +87,7 @@ class RunningShard:
         certificate: Certificate | None,
         free: FreeShard | None = None,
         session: zenoh.Session | None = None,
+        metrics: MetricsServer | None = None,
     ) -> None:
         self.settings = settings
         self._ended = threading.Event()
@@ -111,10 +113,16 @@ class RunningShard:
             if self._shared is not None and settings.carrier != "zenoh":
                 self._sockets = SocketService(self.host, self._shared)
                 undo.callback(self._sockets.close)
-            self._metrics: MetricsServer | None = None
+            self._metrics = metrics
             if settings.metrics is not None:
-                self._metrics = _metrics_server(settings, self.host)
-                undo.callback(self._metrics.close)
+                from enact_dist.link.daemon.metrics import MetricsServer, source_of
+
+                source = source_of(self.host, settings.cell)
+                if metrics is not None:
+                    metrics.show(source)
+                else:
+                    self._metrics = MetricsServer(settings.metrics, source)
+                    undo.callback(self._metrics.close)
             self._names = settings.common_names
             self._session = session or self._open_session()
             if session is None:
@@ -309,13 +317,6 @@ def _session_of(settings: DaemonSettings, names: Mapping[str, str] | None) -> ze
     )
 
 
-def _metrics_server(settings: DaemonSettings, host: ShardHost) -> MetricsServer:
-    from enact_dist.link.daemon.metrics import MetricsServer, page
-
-    assert settings.metrics is not None
-    return MetricsServer(settings.metrics, lambda: page(host, settings.cell), host.count)
-
-
 def _shared_folder(settings: DaemonSettings) -> SharedFolder | None:
     """Make the folder that the shard shares with processes of this host.
 
@@ -370,22 +371,34 @@ def take_shard(
     """
     assert settings.store is not None
     require_driver(settings.store.url)
+    from enact_dist.link.daemon.metrics import MetricsServer, StandbyProbes
     from enact_dist.link.postgres.standby import wait_free
 
     certificate = _check(settings)
     name, patient = settings.shard.name, settings.standby
+    probes = StandbyProbes(settings)
+
+    def looked(answered: bool) -> None:
+        probes.looked(answered)
+        waiting()
+
     with ExitStack() as undo:
         session = _session_of(settings, settings.common_names)
         undo.callback(close_session, session)
+        metrics = None
+        if settings.metrics is not None:
+            metrics = MetricsServer(settings.metrics, probes.source())
+            undo.callback(metrics.close)
         while free := wait_free(
             settings.store,
             stopped=stopped,
             patient=patient,
             note=lambda text: _log.info("shard %s stands by: %s", name, text),
-            looked=waiting,
+            looked=looked,
         ):
+            probes.takes()
             try:
-                shard = RunningShard(settings, certificate, free, session)
+                shard = RunningShard(settings, certificate, free, session, metrics)
             except StoreError as error:
                 if not patient:
                     raise

@@ -33,7 +33,7 @@ def wait_free(
     stopped: threading.Event,
     patient: bool,
     note: Callable[[str], None],
-    looked: Callable[[], None] = lambda: None,
+    looked: Callable[[bool], None] = lambda _: None,
 ) -> FreeShard | None:
     """Wait until a shard is free; return it, None once `stopped` is set.
 
@@ -42,7 +42,7 @@ def wait_free(
         stopped: Ends the wait.
         patient: Whether to wait for the end of a holder that lives, and for the database.
         note: Called with what is waited for, once for each.
-        looked: Called after each look, ten times a second.
+        looked: Called after each look, ten times a second, with whether the database answered.
 
     Raises:
         ShardHeldError: Another process holds it, and this one is not patient.
@@ -54,6 +54,7 @@ def wait_free(
     noted, told = "", False
     try:
         while not stopped.is_set():
+            answered = False
             try:
                 if session is None:
                     session, told = connector.connect(), False
@@ -66,6 +67,7 @@ def wait_free(
                     session.row(NAME_ME, (name_of_standby(shard, myself()),))
                 if watch.is_free(seen, time.monotonic_ns()):
                     return FreeShard(address, seen)
+                answered = True
                 found = f"{address} is served by process {seen.holder}"
                 if watch.alive and not patient:
                     raise ShardHeldError(
@@ -85,7 +87,7 @@ def wait_free(
             if found != noted:
                 note(found)
                 noted = found
-            looked()
+            looked(answered)
             stopped.wait(LOOK_S)
     finally:
         if session is not None:
