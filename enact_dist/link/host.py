@@ -201,9 +201,8 @@ class ShardHost:
     ) -> None:
         """Pass a request to the shard; `reply` is called once, now or later, from any thread.
 
-        If the host ends or fails first, `reply` is never called: no answer means *unknown*.
-        `identity` is the sender as the transport knows it ("": this process), `subject` the one
-        whose rights it uses (None: the transport vouches for no name).
+        If the host ends first, `reply` is never called: no answer means *unknown*.  `identity` is
+        the sender ("": this process), `subject` whose rights it uses (None: no name is proven).
         """
         kind = type(message)
         if kind is Commit or kind is Prepare:
@@ -344,7 +343,6 @@ class ShardHost:
     def _handle_now(
         self, message: Request | Event, handle: int, identity: str, subject: str | None
     ) -> None:
-        clock = self._clock
         later: list[Publish | Story] = []
         try:
             effects = self._shard.handle(
@@ -352,8 +350,8 @@ class ShardHost:
                 reply_to=handle,
                 identity=identity,
                 subject=subject,
-                now_ns=clock.monotonic_ns(),
-                wall_ns=clock.wall_ns(),
+                now_ns=self._clock.monotonic_ns(),
+                wall_ns=self._clock.wall_ns(),
             )
             for effect in self.silence.passing(effects) if self.silence else effects:
                 if isinstance(effect, Reply):  # answers first, since clients wait for them
