@@ -8,8 +8,8 @@ from enact_dist.core.failover.lease import (
     DRIFT_PPM,
     OUTAGE_NS,
     BrokenBatch,
+    HolderRow,
     Lease,
-    ShardRow,
     Standby,
     after_break,
 )
@@ -22,14 +22,14 @@ def test_two_clocks_that_drift_apart_never_let_two_daemons_serve():
     """The slowest holder falls silent before the fastest standby takes the shard over."""
     lease, standby = Lease(LEASE_NS), Standby(LEASE_NS)
     lease.confirmed(0)
-    standby.is_free(ShardRow(7, 3, 1, "a"), 0)
+    standby.is_free(HolderRow(7, 3, 1, "a"), 0)
     fast, slow = 1 + 0.99 * DRIFT_PPM / 1e6, 1 - 0.99 * DRIFT_PPM / 1e6
 
     silent_s = lease.until_ns / slow / 1e9
     taken_s = next(
         at_ns / 1e9
         for at_ns in range(0, 2 * LEASE_NS, 1_000_000)
-        if standby.is_free(ShardRow(7, 3, 1, "a"), int(at_ns * fast))
+        if standby.is_free(HolderRow(7, 3, 1, "a"), int(at_ns * fast))
     )
 
     assert silent_s < taken_s
@@ -47,7 +47,7 @@ def test_a_lease_never_gets_shorter():
     assert not lease.holds(until_ns)
 
 
-HELD = ShardRow(7, 3, 1, "host 1")
+HELD = HolderRow(7, 3, 1, "host 1")
 
 
 @pytest.fixture
@@ -99,12 +99,12 @@ def test_a_holder_that_came_back_has_its_usual_lease(standby):
 @pytest.mark.parametrize(
     ("row", "found"),
     [
-        (ShardRow(7, 4, 9, "a"), BrokenBatch.STANDS),
-        (ShardRow(7, 3, 9, "a"), BrokenBatch.MISSING),
-        (ShardRow(8, 4, 9, "b"), BrokenBatch.TAKEN),
-        (ShardRow(8, 3, 9, "b"), BrokenBatch.TAKEN),
-        (ShardRow(7, 5, 9, "a"), BrokenBatch.TAKEN),
-        (ShardRow(6, 4, 9, "a"), BrokenBatch.TAKEN),
+        (HolderRow(7, 4, 9, "a"), BrokenBatch.STANDS),
+        (HolderRow(7, 3, 9, "a"), BrokenBatch.MISSING),
+        (HolderRow(8, 4, 9, "b"), BrokenBatch.TAKEN),
+        (HolderRow(8, 3, 9, "b"), BrokenBatch.TAKEN),
+        (HolderRow(7, 5, 9, "a"), BrokenBatch.TAKEN),
+        (HolderRow(6, 4, 9, "a"), BrokenBatch.TAKEN),
     ],
 )
 def test_the_row_says_what_became_of_a_batch(row, found):

@@ -11,7 +11,7 @@ from postgres_nodes import await_sync
 from shard_stores import address_of, state, take, versions
 from tcp_proxy import TcpProxy
 
-from enact_dist.core.failover.lease import ShardRow
+from enact_dist.core.failover.lease import HolderRow
 from enact_dist.errors import StoreError
 from enact_dist.link.lease import ShardTakenError
 from enact_dist.link.postgres.address import FreeShard, ShardHeldError
@@ -72,7 +72,7 @@ def test_an_old_daemon_writes_nothing(server, stores):
         epoch, _, holder = row_of(server, address)
         beat = server.execute("SELECT beat FROM enact.shard WHERE epoch = %s", (epoch,))[0][0]
         medium._renewer.close()
-        free = FreeShard(address, ShardRow(epoch, 0, beat, holder))
+        free = FreeShard(address, HolderRow(epoch, 0, beat, holder))
         new, recovered = open_database(free, unix_s=1)
         with closing(new):
             with pytest.raises(ShardTakenError, match=address.shard):

@@ -111,7 +111,7 @@ def takes_what_it_finds(patch):
     """A takeover does not name the row that the standby saw."""
 
     def taking(self, _seen, epoch, found):
-        return daemons.RowChange(lease.ShardRow(epoch, found.batch, found.beat + 1, self.name))
+        return daemons.RowChange(lease.HolderRow(epoch, found.batch, found.beat + 1, self.name))
 
     patch(SimulatedDaemon, "taking", taking)
 

@@ -35,7 +35,7 @@ _STAY: Final = frozenset((Persist, Story))
 """Effects that reach no client and no other shard."""
 
 
-class ShardRow(NamedTuple):
+class HolderRow(NamedTuple):
     """The row of a shard in the database.
 
     Attributes:
@@ -153,7 +153,7 @@ class Standby:
         self._seen = None
         self._wait_ns = waited_ns(self._lease_ns + OUTAGE_NS)
 
-    def is_free(self, row: ShardRow, now_ns: int) -> bool:
+    def is_free(self, row: HolderRow, now_ns: int) -> bool:
         """Whether no process can answer for the shard, as of a look that ended at `now_ns`."""
         if self._seen != (row.epoch, row.beat):
             self.alive = self._seen is not None

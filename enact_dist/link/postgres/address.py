@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from enact_dist.core.failover.lease import ShardRow
+from enact_dist.core.failover.lease import HolderRow
 from enact_dist.errors import StoreError
 
 LEASE_S_DEFAULT: Final = 2.0
@@ -39,7 +39,7 @@ class FreeShard(NamedTuple):
     """A shard that no process held when it was last seen."""
 
     address: StoreAddress
-    seen: ShardRow
+    seen: HolderRow
 
 
 class ShardHeldError(StoreError):

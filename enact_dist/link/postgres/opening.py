@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from psycopg.types.numeric import Int8
 
-from enact_dist.core.failover.lease import ShardRow
+from enact_dist.core.failover.lease import HolderRow
 from enact_dist.errors import StoreError
 from enact_dist.link.folder.folder import refuse
 from enact_dist.link.lease import HostLease
@@ -39,7 +39,7 @@ def connector_of(address: StoreAddress) -> Connector:
     return Connector(address.url, f"enact {address.cell} {address.shard} on {myself()}")
 
 
-def look(session: DatabaseSession, address: StoreAddress) -> tuple[int, ShardRow]:
+def look(session: DatabaseSession, address: StoreAddress) -> tuple[int, HolderRow]:
     """Return a shard's row and who holds it; make the row and the tables if they are missing.
 
     Raises:
@@ -50,14 +50,14 @@ def look(session: DatabaseSession, address: StoreAddress) -> tuple[int, ShardRow
     return _row(session, address)
 
 
-def _row(session: DatabaseSession, address: StoreAddress, more: str = "") -> tuple[int, ShardRow]:
+def _row(session: DatabaseSession, address: StoreAddress, more: str = "") -> tuple[int, HolderRow]:
     """Return the id of a shard's row, and the row."""
     statement, values = state_of_shard(address.cell, address.shard)
     found = session.row(statement + more, values)
     if found is None:
         raise StoreError(f"{address} has gone from the database", path=str(address))
     shard, _, epoch, batch, beat, holder = found
-    return shard, ShardRow(epoch, batch, beat, holder)
+    return shard, HolderRow(epoch, batch, beat, holder)
 
 
 def open_database(free: FreeShard, *, unix_s: int) -> tuple[Store, Recovered]:
@@ -106,7 +106,7 @@ def _medium(session: DatabaseSession, tenure: HeldRow) -> PostgresMedium:
 
 
 def _fence(
-    session: DatabaseSession, address: StoreAddress, unix_s: int, seen: ShardRow
+    session: DatabaseSession, address: StoreAddress, unix_s: int, seen: HolderRow
 ) -> tuple[int, int, int]:
     """Begin a new epoch; return the shard's row, the epoch, and the number of the newest batch."""
     session.commit_as(CONFIRMED)

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 from enact_dist.core.failover.lease import (
     BrokenBatch,
+    HolderRow,
     Lease,
-    ShardRow,
     Silence,
     Standby,
     after_break,
@@ -130,7 +130,7 @@ class SimulatedDaemon(ShardNode):
             self._breaks = line.breaks
             self._standby.was_away()
 
-        def seen(row: ShardRow, _persists: tuple[Persist, ...]) -> None:
+        def seen(row: HolderRow, _persists: tuple[Persist, ...]) -> None:
             line.done()
             if self._standby.is_free(row, self.local_ns):
                 self._take_over(row)
@@ -139,7 +139,7 @@ class SimulatedDaemon(ShardNode):
 
         self.database.read(connection, seen)
 
-    def _take_over(self, row: ShardRow) -> None:
+    def _take_over(self, row: HolderRow) -> None:
         """Make an epoch of one's own, if the shard's row is still the one that was seen."""
         line, sent_ns = self._lines[0], self.local_ns
         epoch = max(row.epoch + 1, self.wall_ns // S)
@@ -161,11 +161,11 @@ class SimulatedDaemon(ShardNode):
 
         self.database.write(connection, partial(self.taking, row, epoch), taken)
 
-    def taking(self, seen: ShardRow, epoch: int, found: ShardRow) -> RowChange | None:
+    def taking(self, seen: HolderRow, epoch: int, found: HolderRow) -> RowChange | None:
         """Return the row of a takeover, if the shard's row is the one that was seen."""
         if (seen.epoch, seen.beat) != (found.epoch, found.beat):
             return None
-        return RowChange(ShardRow(epoch, found.batch, found.beat + 1, self.name))
+        return RowChange(HolderRow(epoch, found.batch, found.beat + 1, self.name))
 
     def _load(self) -> None:
         line = self._lines[0]
@@ -173,7 +173,7 @@ class SimulatedDaemon(ShardNode):
         if connection is None:
             return
 
-        def loaded(row: ShardRow, persists: tuple[Persist, ...]) -> None:
+        def loaded(row: HolderRow, persists: tuple[Persist, ...]) -> None:
             line.done()
             if row.epoch != self._epoch:
                 self.ends("another daemon took the shard")
@@ -216,7 +216,7 @@ class SimulatedDaemon(ShardNode):
         put = partial(self.putting, number, batch)
         self.database.write(connection, put, partial(self._sent, batch, sent_ns))
 
-    def putting(self, number: int, batch: tuple[Persist, ...], row: ShardRow) -> RowChange | None:
+    def putting(self, number: int, batch: tuple[Persist, ...], row: HolderRow) -> RowChange | None:
         """Return the row of a batch with its records, if it follows the one before."""
         if (row.epoch, row.batch) != (self._epoch, number - 1):
             return None
@@ -235,7 +235,7 @@ class SimulatedDaemon(ShardNode):
     def _ask(self, connection: Wire, batch: tuple[Persist, ...], sent_ns: int) -> None:
         """Ask what became of a batch whose answer was lost."""
 
-        def seen(row: ShardRow, _persists: tuple[Persist, ...]) -> None:
+        def seen(row: HolderRow, _persists: tuple[Persist, ...]) -> None:
             found = after_break(row[:2], epoch=self._epoch, batch=self._batch)
             if found is BrokenBatch.TAKEN:
                 self.ends("another daemon took the shard")
@@ -269,7 +269,7 @@ class SimulatedDaemon(ShardNode):
                 self.event(Persisted(persist.ticket))
 
     def _beat(self, connection: Wire, done: Callable[[StatementDone], None]) -> None:
-        def beat(row: ShardRow) -> RowChange | None:
+        def beat(row: HolderRow) -> RowChange | None:
             return RowChange(row._replace(beat=row.beat + 1)) if row.epoch == self._epoch else None
 
         self.database.write(connection, beat, done)

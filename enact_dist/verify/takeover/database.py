@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
-from enact_dist.core.failover.lease import ShardRow
+from enact_dist.core.failover.lease import HolderRow
 from enact_dist.verify.simulation.hosts.world import MS
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ NOTICES_NS = 1_000 * MS
 class RowChange(NamedTuple):
     """What one committed transaction left: the row, and new records."""
 
-    row: ShardRow
+    row: HolderRow
     persists: tuple[Persist, ...] = ()
 
 
@@ -41,14 +41,14 @@ class StatementDone(NamedTuple):
         warned: The wait for the standby was cancelled, which the server reports as success.
     """
 
-    row: ShardRow | None
+    row: HolderRow | None
     warned: bool = False
 
 
 @dataclass(slots=True, eq=False)
 class _Write:
     line: Wire
-    make: Callable[[ShardRow], RowChange | None]
+    make: Callable[[HolderRow], RowChange | None]
     done: Callable[[StatementDone], None]
     position: int = 0
 
@@ -87,7 +87,7 @@ class SimulatedDatabase:
         self.world, self.name = world, name
         self._luck = world.schedule.stream(f"{name} on its way")
         self.primary: Primary | None = Primary(
-            [RowChange(ShardRow(0, 0, 0, ""))], on_standby=1, seen=1
+            [RowChange(HolderRow(0, 0, 0, ""))], on_standby=1, seen=1
         )
         self._stalled_until_ns = 0
         self._connections: list[Wire] = []
@@ -106,7 +106,7 @@ class SimulatedDatabase:
         self._connections.append(line)
         return line
 
-    def read(self, line: Wire, done: Callable[[ShardRow, tuple[Persist, ...]], None]) -> None:
+    def read(self, line: Wire, done: Callable[[HolderRow, tuple[Persist, ...]], None]) -> None:
         """Read the row and all records that can be seen."""
 
         def answer() -> None:
@@ -119,7 +119,7 @@ class SimulatedDatabase:
     def write(
         self,
         line: Wire,
-        make: Callable[[ShardRow], RowChange | None],
+        make: Callable[[HolderRow], RowChange | None],
         done: Callable[[StatementDone], None],
     ) -> None:
         """RowChange the row and add records, if `make` finds the row as it must be."""

@@ -2,7 +2,7 @@
 
 Clients add one to what they find, under locks over one or two shards.  At the end the database's
 log says what was written, by whom and in which order; `verify.checker` judges it together with what
-each client was told: nothing that was acknowledged is lost, doubled or invented, nothing stale was
+each client learned: nothing that was acknowledged is lost, doubled or invented, nothing stale was
 shown under a lock, and there is an order for all of it.
 """
 
