@@ -159,16 +159,18 @@ class Page:
                 self._samples.add(data[slot])
         shown = {slot: data[slot] for slot in (*drawn, *labelled) if slot in data}
         whole = len(shown) >= len(drawn) or now_s > self._begun_s + FITTED_S
-        self._draw(shown, fits=self._fits > (0 if whole else 1))
+        scenes = contents.scenes(shown)
         if listing_due and player.live:
             contents.learn_history(self._of_history())
         line = player.timeline
-        self._time.range(line.span_s, line.span_s if player.live else line.seconds(player.at_ns))
-        if listing_due:
-            self._show_panels(data)
+        with self._client.atomic():  # sent at once: each message alone costs as much as all
+            self._draw(scenes, fits=self._fits > (0 if whole else 1))
+            at_s = line.span_s if player.live else line.seconds(player.at_ns)
+            self._time.range(line.span_s, at_s)
+            if listing_due:
+                self._show_panels(data)
 
-    def _draw(self, data: dict[Slot, ShownDatum], *, fits: bool) -> None:
-        scenes = self.contents.scenes(data)
+    def _draw(self, scenes: dict[str, SceneView], *, fits: bool) -> None:
         if fits and scenes[""].nodes:
             self._fit(scenes[""])
         if self._canvas.draw(scenes):
