@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeVar
 
 from enact_dist.access.asking import expected, explained, in_parts
@@ -211,21 +210,18 @@ class CellSource:
         items = [Item(int(Access.VIEW), *slot) for slot in slots]
         with HeldView(self.session, items, past_ns=at_ns) as view:
             found: dict[Slot, Recorded] = {}
-            for shard, _, state in view.states:
+            new = []
+            for reading in view.states:
+                state = reading.state
                 known = before.get(state.slot)
-                version = (state.version, state.stamp_ns)
-                if known is not None and (known.version, known.stamp_ns) == version:
+                if known is not None and known.state == (state.version, state.stamp_ns):
                     found[state.slot] = known
                 else:
-                    facts = (state.slot, *version, shard, 0)
-                    found[state.slot] = Recorded(*facts, None, state.null_reason)
-            new = [
-                one
-                for one in view.states
-                if found[one.state.slot].datum is None and not one.state.null_reason
-            ]
-            for slot, datum in view.fetch(new).items():
-                found[slot] = replace(found[slot], datum=datum)
+                    new.append(reading)
+            data = view.fetch([one for one in new if not one.state.null_reason])
+            for shard, _, state in new:
+                facts = (state.slot, state.version, state.stamp_ns, shard, 0)
+                found[state.slot] = Recorded(*facts, data.get(state.slot), state.null_reason)
             return found
 
     def histories(self, slots: Sequence[Slot]) -> Histories:
