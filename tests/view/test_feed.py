@@ -20,6 +20,7 @@ from enact_dist.view.pages import datum
 from enact_dist.view.pages.comparing import MARKED, NOW, Side
 from enact_dist.view.pages.contents import PageContents
 from enact_dist.view.pages.datum import Lineage, Samples, recording_of
+from enact_dist.view.pages.texts import datum_of
 from enact_dist.view.pages.viewer import Viewer, ViewSettings
 from enact_dist.view.recorded import RecordingFeed, RecordingSource
 from enact_dist.view.source import CellSource
@@ -391,7 +392,9 @@ def test_a_recording_is_a_past(cell, tmp_path):
     for position, x_m in ((positions[2], 3.0), (positions[0], 1.0), (positions[1], 2.0)):
         contents = PageContents(feed, source, lambda *_: None)
         contents.player.look_back(source.timeline, position.stamp_ns)
-        assert contents.data([SLOT])[SLOT].value[0, 3] == x_m
+        found = contents.data([SLOT])[SLOT]
+        assert found.value[0, 3] == x_m
+        assert "by writer, process" in datum_of(contents, Samples(), SLOT, found)
 
 
 def test_no_page_reads_a_recording_again_for_another(cell, tmp_path, monkeypatch):

@@ -63,6 +63,8 @@ def datum_of(
     parts = [f"v{recorded.version}", markup.clock(recorded.stamp_ns)]
     if recorded.captured_ns:
         parts.append(f"captured {markup.clock(recorded.captured_ns)}")
+    if recorded.actor:  # a recording knows who wrote it; of a cell, the tree says so
+        parts.append(f"by {recorded.actor}, process {recorded.pid} on {recorded.host}")
     if recorded.null_reason:
         parts.append(f"null: {recorded.null_reason}")
     until_ns = 0 if contents.player.live else contents.player.at_ns
