@@ -29,7 +29,7 @@ def asked(lock):
     texts = {
         "build.txt": PROJECT["build-system"]["requires"],
         "core.txt": project["dependencies"],
-        "record.txt": project["dependencies"] + extras["record"],
+        "record.txt": project["dependencies"] + extras["record"] + extras["postgres"],
         "perception.txt": project["dependencies"] + extras["actors"],
         "workcell.txt": project["dependencies"] + extras["workcell"] + extras["record"],
     }[lock]

@@ -18,7 +18,14 @@ from enact_dist.core.shard.state import ShardSettings
 from enact_dist.core.state.clock import Latencies
 from enact_dist.errors import LinkError
 from enact_dist.link.daemon import metrics
-from enact_dist.link.daemon.metrics import CONTENT_TYPE, METRICS, MetricsServer, page, table
+from enact_dist.link.daemon.metrics import (
+    CONTENT_TYPE,
+    METRICS,
+    MetricsServer,
+    MetricsSource,
+    source_of,
+    table,
+)
 from enact_dist.link.opening import open_host
 
 DOCUMENT = Path(__file__).parents[2] / "deploy" / "metrics.md"
@@ -53,7 +60,7 @@ def peer(host, make_peer):
 @pytest.fixture
 def served(host):
     """Ask a real server for the metrics: `served()` returns its text."""
-    server = MetricsServer(("127.0.0.1", 0), lambda: page(host, 'cell "a"'), host.count)
+    server = MetricsServer(("127.0.0.1", 0), source_of(host, 'cell "a"'))
 
     def ask(path="/metrics"):
         with DIRECT.open(f"http://127.0.0.1:{server.port}{path}", timeout=30) as answer:
@@ -195,7 +202,41 @@ def test_address_in_use_is_named():
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         with pytest.raises(LinkError, match=rf"127.0.0.1:{port}: Address already in use; name"):
-            MetricsServer(("127.0.0.1", port), str, print)
+            MetricsServer(("127.0.0.1", port), MetricsSource(str, bool, bool, print))
+
+
+def probe(server, path):
+    """Return the status and the text of a probe."""
+    try:
+        with DIRECT.open(f"http://127.0.0.1:{server.port}{path}", timeout=30) as answer:
+            return answer.status, answer.read().decode()
+    except urllib.error.HTTPError as error:
+        return error.code, error.read().decode()
+
+
+def test_a_shard_that_grants_locks_is_alive_and_ready(served, host):
+    """Both probes answer; while it drains, it is alive alone."""
+    assert probe(served.server, "/alive") == (200, "yes\n")
+    assert probe(served.server, "/ready?x=1") == (200, "yes\n")
+    host.drain()
+    assert probe(served.server, "/ready") == (503, "no\n")
+    assert probe(served.server, "/alive") == (200, "yes\n")
+    assert probe(served.server, "/live")[0] == 404
+
+
+def test_a_dispatcher_that_hangs_is_not_alive(host, monkeypatch):
+    """A pulse counts for a while only, and each tick of the shard is a beat."""
+    ticks = []
+    monkeypatch.setattr(host, "each_tick", ticks.append)
+    monkeypatch.setattr(metrics.time, "monotonic", lambda: now_s)
+    now_s = 100.0
+    source = metrics.source_of(host, "cell")
+    now_s += metrics.ALIVE_S - 0.1
+    assert source.alive()
+    now_s += 0.2
+    assert not source.alive()
+    ticks[0]()
+    assert source.alive()
 
 
 def test_readers_for_whom_there_was_no_thread_take_no_place(served, monkeypatch):

@@ -1,10 +1,11 @@
 """Which host a store connects to, and what each class of durability asks of the database."""
 
+import psycopg
 import pytest
 from ports import free_port
 from shard_stores import address_of, state
 
-from enact_dist.link.postgres.connection import Connector
+from enact_dist.link.postgres.connection import LOST, Connector
 from enact_dist.terms import Durability
 
 
@@ -47,3 +48,20 @@ def test_nothing_of_ours_cancels_a_wait_for_the_standby(server):
         "work_mem": "8MB",
         "client_min_messages": "warning",
     }
+
+
+def test_the_end_of_an_idle_connection_is_no_warning(server):
+    """The server's last words come as a notice; the connection is lost, and a new one helps."""
+    session = Connector(server.url, "test").connect()
+    line = session.connection.pgconn
+    server.execute("SELECT pg_terminate_backend(%s)", (line.backend_pid,))
+    words = []
+    session.connection.add_notice_handler(lambda notice: words.append(notice.sqlstate))
+    with pytest.raises(psycopg.OperationalError):
+        while True:
+            line.consume_input()
+            line.is_busy()
+    assert words == ["57P01"]
+    session.check()
+    with pytest.raises(LOST):
+        session.row("SELECT 1")

@@ -1,7 +1,7 @@
 """Bench `security`: what keys and rights cost, beside a plain cell in the same run.
 
-Both cells have one daemon and are reached over Zenoh only, without memory in common.  The secured
-one has keys, and rights with rules for `NAMES` names.
+Both cells have one daemon.  The secured one has keys, and rights with rules for `NAMES` names.
+Both are reached over Zenoh, without memory in common; updates also over their Unix sockets.
 """
 
 from __future__ import annotations
@@ -12,23 +12,27 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.bench.cases.payloads import fetch, floats, store
 from enact_dist.bench.cases.updates import slots, update
-from enact_dist.bench.place import WORLD, fresh_place
+from enact_dist.bench.place import CARRIER_VARIABLE, WORLD, environment, fresh_place
 from enact_dist.bench.rows import Case, at_most, times
 from enact_dist.bench.timing import timed
 from enact_dist.core.protocol.messages import Ping
 from enact_dist.core.rights.rules import Rights, Rule
 from enact_dist.link.client.fetch import DatumCache
 from enact_dist.terms import Entity
+from enact_dist.world.connecting import connect
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
+    from enact_dist.bench.place import Place
     from enact_dist.bench.run import Run
     from enact_dist.world.context import WorldContext
 
 NAMES: Final = 61
 RULES: Final = 1_000
 LARGE: Final = Entity("s0/large")
+NEAR: Final = "program1"
+"""The name that asks over the socket, and the first segment of all that it may write."""
 LARGE_BYTES: Final = 30_000_000
 CALL_S: Final = 5.0
 PLAIN, LOCKED = "plain", f"keys, rules for {NAMES} names"
@@ -41,7 +45,30 @@ def run_security(run: Run) -> None:
         for what, names in ((PLAIN, 0), (LOCKED, NAMES)):
             place, _ = stack.enter_context(fresh_place("zenoh", names=names))
             cases += _cases(what, stack.enter_context(place.far_world()))
+            cases.append(_near(what, stack.enter_context(_near_world(place))))
         run.measure([*cases, _known(), _new()])
+
+
+@contextlib.contextmanager
+def _near_world(place: Place) -> Iterator[WorldContext]:
+    """Give the world context as a client with limited rights on the daemon's host has it."""
+    with environment(**{CARRIER_VARIABLE: "socket"}):
+        cell = connect(place.target, actor=NEAR)
+    with cell:
+        yield cell.world(WORLD)
+
+
+def _near(what: str, world: WorldContext) -> Case:
+    name = "update over a socket, volatile"
+    writes = slots(world, 1, entity=f"{NEAR}/counter")
+    plain = ("security", f"{name}, {PLAIN}")
+    return Case(
+        "security",
+        f"{name}, {what}",
+        lambda seconds_s: timed(lambda: update(writes), seconds_s),
+        plain if what == LOCKED else None,
+        times(1.1, plain, "≤ 1.1 x plain") if what == LOCKED else None,
+    )
 
 
 def _cases(what: str, world: WorldContext) -> list[Case]:

@@ -4,6 +4,9 @@ Each counter of `link.daemon.counters` becomes ``enact_NAME_total``, and each ot
 ``enact_NAME``, with the meaning given there as help text.  All samples have the labels `cell` and
 `shard`.  The table in `deploy/metrics.md` is `table()`.
 
+Beside the page there are two probes for a supervisor such as Kubernetes, which cost no process.
+``GET /alive`` and ``GET /ready`` answer with 200 or 503.
+
 The page is served over HTTP from threads that never block the shard.  A slow reader occupies one of
 `READERS_MAX` threads, for at most `READ_S` per step; further readers are refused.  While the
 process has no free descriptor, new connections stay in the queue and are tried again after a pause.
@@ -14,6 +17,9 @@ from __future__ import annotations
 import logging
 import socket
 import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler
 from itertools import accumulate
@@ -25,14 +31,19 @@ from enact_dist.errors import LinkError
 from enact_dist.link.daemon.counters import GAUGES_OF_A_SHARD, LATENCIES_OF_A_SHARD, OF_A_SHARD
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
 
     from enact_dist.core.state.clock import Latencies
+    from enact_dist.link.daemon.settings import DaemonSettings
     from enact_dist.link.host import ShardHost
 
 READERS_MAX: Final = 8
 READ_S: Final = 5.0
 PATH: Final = "/metrics"
+ALIVE_S: Final = 20.0
+"""How long a dispatcher may stand still, as in the unit of systemd."""
+SEES_S: Final = 5.0
+"""How long a daemon that stands by sees its database after a look at it."""
 POLL_S: Final = 0.1
 """How long `close` may wait for the thread that accepts."""
 PAUSE_S_MIN: Final = 0.05
@@ -42,13 +53,49 @@ PAUSE_S_MAX: Final = 1.0
 _log = logging.getLogger("enact.link")
 
 
+class Pulse:
+    """Whether something has happened lately.  Thread-safe.
+
+    Args:
+        for_s: How long one beat counts.
+    """
+
+    def __init__(self, for_s: float) -> None:
+        self._for_s = for_s
+        self._until_s = 0.0
+
+    def beat(self) -> None:
+        """Note that it happens now."""
+        self._until_s = time.monotonic() + self._for_s
+
+    def __call__(self) -> bool:
+        """Return whether the last beat still counts."""
+        return time.monotonic() < self._until_s
+
+
+@dataclass(frozen=True, slots=True)
+class MetricsSource:
+    """What a server of metrics shows; called from its threads.
+
+    Attributes:
+        page: Returns the metrics.
+        alive: Whether the process does its work.
+        ready: Whether the shard serves, or stands by and sees its database.
+        count: Called with "metrics_readers_refused" for each refused reader.
+    """
+
+    page: Callable[[], str]
+    alive: Callable[[], bool]
+    ready: Callable[[], bool]
+    count: Callable[[str], None]
+
+
 class MetricsServer:
-    """Answers ``GET /metrics`` until it is closed.
+    """Answers ``GET /metrics``, ``/alive`` and ``/ready`` until it is closed.
 
     Args:
         address: Host and port; port 0 takes any that is free.
-        page: Returns the page; called from the server's threads.
-        count: Called with "metrics_readers_refused" for each refused reader.
+        source: What it shows, until `show`.
 
     Attributes:
         port: The port on which it listens.
@@ -57,12 +104,10 @@ class MetricsServer:
         LinkError: The address is in use, or not an address of this host.
     """
 
-    def __init__(
-        self, address: tuple[str, int], page: Callable[[], str], count: Callable[[str], None]
-    ) -> None:
+    def __init__(self, address: tuple[str, int], source: MetricsSource) -> None:
         host, port = address
         try:
-            self._server = _Server(address, page, count)
+            self._server = _Server(address, source)
         except OSError as error:
             raise LinkError(
                 f"metrics cannot be served at {host}:{port}: {error.strerror or error}; name"
@@ -73,6 +118,10 @@ class MetricsServer:
             target=lambda: self._server.serve_forever(POLL_S), name="enact-metrics", daemon=True
         )
         self._thread.start()
+
+    def show(self, source: MetricsSource) -> None:
+        """Show something else from now on."""
+        self._server.source = source
 
     def close(self) -> None:
         """Stop listening; idempotent."""
@@ -87,13 +136,10 @@ class _Server(ThreadingMixIn, TCPServer):
     daemon_threads = True
     block_on_close = False
 
-    def __init__(
-        self, address: tuple[str, int], page: Callable[[], str], count: Callable[[str], None]
-    ) -> None:
+    def __init__(self, address: tuple[str, int], source: MetricsSource) -> None:
         self.address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
-        self.page = page
+        self.source = source
         self.ending = threading.Event()
-        self._count = count
         self._pause_s = 0.0
         self._room = threading.BoundedSemaphore(READERS_MAX)
         super().__init__(address, _Handler)
@@ -105,7 +151,7 @@ class _Server(ThreadingMixIn, TCPServer):
         except OSError as error:
             if not self._pause_s:
                 _log.warning("cannot accept a reader of the metrics now: %s", error)
-            self._count("metrics_readers_refused")
+            self.source.count("metrics_readers_refused")
             self._pause_s = min(max(2 * self._pause_s, PAUSE_S_MIN), PAUSE_S_MAX)
             self.ending.wait(self._pause_s)
             raise
@@ -114,14 +160,14 @@ class _Server(ThreadingMixIn, TCPServer):
 
     def process_request(self, request: Any, client_address: Any) -> None:
         if not self._room.acquire(blocking=False):
-            self._count("metrics_readers_refused")
+            self.source.count("metrics_readers_refused")
             self.shutdown_request(request)
             return
         try:
             super().process_request(request, client_address)
         except BaseException:  # the system has no more threads
             self._room.release()
-            self._count("metrics_readers_refused")
+            self.source.count("metrics_readers_refused")
             raise
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
@@ -141,11 +187,16 @@ class _Handler(BaseHTTPRequestHandler):
     server_version, sys_version = "enact", ""
 
     def do_GET(self) -> None:
-        if self.path.partition("?")[0] != PATH:
-            self.send_error(HTTPStatus.NOT_FOUND, f"this server has only {PATH}")
+        source = cast("_Server", self.server).source
+        path = self.path.partition("?")[0]
+        probe = {"/alive": source.alive, "/ready": source.ready}.get(path)
+        if probe is None and path != PATH:
+            self.send_error(HTTPStatus.NOT_FOUND, f"this server has only {PATH}, /alive and /ready")
             return
-        body = cast("_Server", self.server).page().encode()
-        self.send_response(HTTPStatus.OK)
+        passed = probe is None or probe()
+        text = source.page() if probe is None else f"{'yes' if passed else 'no'}\n"
+        body = text.encode()
+        self.send_response(HTTPStatus.OK if passed else HTTPStatus.SERVICE_UNAVAILABLE)
         self.send_header("Content-Type", CONTENT_TYPE)
         self.send_header("Content-Length", str(len(body)))
         self.end_headers()
@@ -176,9 +227,57 @@ METRICS: Final = tuple(
 """All metrics of a shard, in the order in which it serves them."""
 
 
+def source_of(host: ShardHost, cell: str) -> MetricsSource:
+    """Return what a running shard shows."""
+    alive = Pulse(ALIVE_S)
+    alive.beat()
+    host.each_tick(alive.beat)
+    ready = lambda: bool(host.figures()["ready"])  # noqa: E731 - one of four
+    return MetricsSource(lambda: page(host, cell), alive, ready, host.count)
+
+
+class StandbyProbes:
+    """What a daemon shows while it stands by, and while it reads the shard that it has taken over.
+
+    Args:
+        settings: The settings of its shard, with an address for metrics.
+    """
+
+    def __init__(self, settings: DaemonSettings) -> None:
+        self._alive, self._sees = Pulse(ALIVE_S), Pulse(SEES_S)
+        self._alive.beat()
+        self._takes = False
+        labels = _labels(settings.cell, settings.shard.name)
+        self._page = "".join(
+            f"# HELP {one.name} {one.meaning}\n# TYPE {one.name} gauge\n{one.name}{{{labels}}} 1\n"
+            for one in METRICS
+            if one.figure == "standby"
+        )
+
+    def source(self) -> MetricsSource:
+        """Return it for a server."""
+        return MetricsSource(
+            page=lambda: self._page,
+            alive=lambda: self._takes or self._alive(),
+            ready=lambda: not self._takes and self._sees(),
+            count=lambda _: None,
+        )
+
+    def looked(self, answered: bool) -> None:
+        """Note a look at the shard's row, and whether the database answered."""
+        self._takes = False
+        self._alive.beat()
+        if answered:
+            self._sees.beat()
+
+    def takes(self) -> None:
+        """Note that the shard is taken over now, which takes as long as it takes to read it."""
+        self._takes = True
+
+
 def page(host: ShardHost, cell: str) -> str:
     """Return all metrics of a shard in the format of Prometheus, without locking the shard."""
-    labels = f'cell="{_escaped(cell)}",shard="{_escaped(host.name)}"'
+    labels = _labels(cell, host.name)
     figures, latencies = host.figures(), host.latencies()
     lines: list[str] = []
     for metric in METRICS:
@@ -201,6 +300,10 @@ def _histogram(name: str, labels: str, latencies: Latencies) -> Iterator[str]:
 
 def _number(value: float) -> str:
     return str(int(value)) if value == int(value) else repr(float(value))
+
+
+def _labels(cell: str, shard: str) -> str:
+    return f'cell="{_escaped(cell)}",shard="{_escaped(shard)}"'
 
 
 def _escaped(text: str) -> str:

@@ -45,6 +45,8 @@ CONFIRMED: Final = "on"
 """`synchronous_commit` of what must be forced to the disks of both hosts."""
 RECEIVED: Final = "remote_write"
 """Of what the system of the other host has got; less than that is lost with a failover."""
+_LAST_WORDS: Final = frozenset({"FATAL", "PANIC"})
+"""What an idle connection gets as a notice when the server ends it."""
 LOST: Final = (psycopg.OperationalError, psycopg.InterfaceError, errors.ReadOnlySqlTransaction)
 """Errors of a connection, of which `is_lost` picks those that a new one may mend."""
 
@@ -95,6 +97,8 @@ class DatabaseSession:
         connection.add_notice_handler(self._warned)
 
     def _warned(self, notice: errors.Diagnostic) -> None:
+        if notice.severity_nonlocalized in _LAST_WORDS:
+            return  # the connection is lost, and what became of its commit will be asked
         self._warnings.append(f"{notice.sqlstate} {notice.message_primary}")
 
     def commit_as(self, level: str) -> None:
