@@ -41,7 +41,7 @@ ASK_S = 10.0
 @pytest.fixture
 def begin(tmp_path, monkeypatch, carrier):
     """Start shards of a cell: `begin(name, listen, left=…, right=…)`; stopped after the test."""
-    monkeypatch.setattr("enact_dist.link.daemon.daemon.PROBE_S", ASK_S)
+    monkeypatch.setattr("enact_dist.link.daemon.second_daemon.PROBE_S", ASK_S)
     monkeypatch.setattr(Doubts, "ASK_S", ASK_S)
     monkeypatch.setattr(Doubts, "AGAIN_S", 0.0)
     monkeypatch.setattr(Comparing, "ASK_S", ASK_S)

@@ -13,10 +13,10 @@ from tcp_proxy import TcpProxy
 from enact_dist.cli.main import main
 from enact_dist.link.log import READY
 
+pytestmark = pytest.mark.slow
 CLIENTS = 2
-WITHOUT_LOAD_S = 3.0
 BUSY_S = 6.0
-"""What is measured without other load is below 3 s; here the machine does other things, too."""
+"""Without other load it takes less than 3 s; here the machine does other things, too."""
 
 
 @pytest.fixture
@@ -46,7 +46,7 @@ def clients(cell):
         yield start
 
 
-def test_a_standby_takes_over_from_a_killed_daemon(cell, clients, record_property):
+def test_a_standby_takes_over_from_a_killed_daemon(cell, clients):
     """All that was acknowledged is there, and each update counts once; twice, back and forth."""
     active = cell.start(0)
     standby = cell.start(1, says=STANDS_BY)

@@ -46,7 +46,7 @@ class HeldRow(NamedTuple):
 
 
 class Line:
-    """One connection in the service of a tenure.  Used by one thread at a time, but for `end`.
+    """One connection in the service of a tenure.  Used by one thread at a time, but for `end_soon`.
 
     Args:
         tenure: What it writes for.

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from enact_dist.link.postgres.line import HeldRow, Renewer
     from enact_dist.link.store.database import DatabaseRow
 
-_PARTS_AT_ONCE: Final = (16 << 20) // PART_BYTES
+_PARTS_AT_ONCE: Final = (4 << 20) // PART_BYTES
 """Parts of a body in one message: what client and server hold of it at once."""
 
 
