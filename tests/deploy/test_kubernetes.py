@@ -156,8 +156,8 @@ def test_a_container_finds_what_it_mounts_and_asks_for(shard, cell):
     assert environment["ENACT_SHARED_FOLDER"]["value"] == mounted["shared"]
     assert "valueFrom" in environment["ENACT_STORE"]  # no password in a manifest
     assert "@" not in config["data"]["cell.toml"]
-    for probe in ("livenessProbe", "readinessProbe"):
-        assert container[probe]["httpGet"]["port"] in {one["name"] for one in container["ports"]}
+    for probe, path in (("livenessProbe", "/alive"), ("readinessProbe", "/ready")):
+        assert container[probe]["httpGet"] == {"path": path, "port": "metrics"}
 
 
 @pytest.mark.parametrize("shard", SHARDS, ids=name_of)
