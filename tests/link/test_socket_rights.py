@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 import threading
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
 import pytest
 from ports import free_endpoint
 
-from enact_dist import Aspect, Durability, Entities, Entity, Lock, View, Write, connect
+from enact_dist import Aspect, Durability, Entities, Entity, Lock, View, ViewEach, Write, connect
 from enact_dist.config.read import load_config
 from enact_dist.core.rights.rules import Rights
 from enact_dist.errors import LinkError, PermissionDeniedError
@@ -45,20 +45,18 @@ read = "online:**"
 
 
 @contextmanager
-def guarded(tmp_path):
-    """Yield a running shard with rights, and its cell.toml."""
+def guarded(tmp_path, *others):
+    """Yield a running shard with rights, beside it other ones, and their cell.toml."""
     file = tmp_path / "cell.toml"
-    file.write_text(CELL.format(endpoint=free_endpoint()), "utf-8")
+    more = (f'[shards.{name}]\nlisten = "{free_endpoint()}"\n' for name in others)
+    file.write_text(CELL.format(endpoint=free_endpoint()) + "".join(more), "utf-8")
     config = load_config(file, environment={})
-    shard = start_shard(
-        DaemonSettings(
-            config.name, config.shard_settings("s"), config.shard("s").listen, carrier="socket"
-        )
-    )
-    try:
+    with ExitStack() as stack:
+        for one in reversed(config.shards):
+            settings = config.name, config.shard_settings(one.name), one.listen
+            shard = start_shard(DaemonSettings(*settings, carrier="socket"))
+            stack.callback(shard.stop, drain_s=0.0)
         yield shard, file
-    finally:
-        shard.stop(drain_s=0.0)
 
 
 def put(cell, entity, value):
@@ -90,6 +88,19 @@ def test_names_of_one_user_have_their_rights_over_the_socket(tmp_path):
             with pytest.raises(PermissionDeniedError, match="joe may not read"), Lock(seen):
                 pass
         assert shard.host.figures()["permission_denied"] >= 3
+
+
+def test_a_reader_sees_data_whose_aspect_one_shard_does_not_know(tmp_path):
+    """A pattern lies on all shards, and what it has to register there needs no right to write."""
+    with (
+        guarded(tmp_path, "t", "u") as (_, file),
+        connect(file, actor="camera") as camera,
+        connect(file, actor="logger") as logger,
+    ):
+        put(camera, "view/1", 1)
+        seen = ViewEach(logger.world("online"), Entities("view/*"), COUNT)
+        with Lock(seen) as lock:
+            assert list(lock[seen].values()) == [1]
 
 
 def test_a_name_over_zenoh_is_no_proof(tmp_path, monkeypatch):

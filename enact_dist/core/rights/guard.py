@@ -7,7 +7,8 @@ request                                  right
 `Fetch`                                  none for what a lock of the session pins, else `read`
 `Commit`, `Prepare`                      of each slot `change`, `init` or `delete`, by what is there
 `Stage`                                  any of these on anything
-`Register`                               `write` somewhere of each aspect; `register` of new worlds
+`Register`                               `write` somewhere of each aspect, unless it only reads it;
+                                         `register` of new worlds
 `Fork`, `DropWorld`, `KeepVersions`      `fork` and `read` of the whole source; `drop`; `keep`
 `Break`; `ForceAbort`, settled alarms    `break`; `resolve`
 `Survey`, `ListHistory`                  none; what is not readable is left out
@@ -16,6 +17,8 @@ request                                  right
 `ListAudit`, `ListRefusals`
 =======================================  =======================================================
 
+A reader registers what it reads, too, so that every shard of a cell has the same type of it.  From
+one that may not write the aspect, a shard takes neither a new aspect nor more retention.
 A question about one slot alone is refused without `read` of it: it would look like null otherwise.
 Everything else needs none: the owner of a session may renew, release and end, and shards are known
 by their own identity (`enact_dist.core.shard.owners`).  Locks are refused before they get a place
@@ -147,12 +150,16 @@ class Guard:
 
     def _register(self, message: Register, worlds: Collection[str]) -> Refused | None:
         for entry in message.aspects:
-            if not self.rights.may_write_some(self.subject, f"*/{entry.name}/{ALL}"):
+            if not entry.reads and not self.may_alter(entry.name):
                 return self.denied(WRITE, f"aspect {entry.name}")
         for world in message.worlds:
             if world not in worlds and not self.rights.may(self.subject, "register", world):
                 return self.denied("register", world)
         return None
+
+    def may_alter(self, aspect: str) -> bool:
+        """Whether the present subject may register an aspect, or change how it is registered."""
+        return self.rights.may_write_some(self.subject, f"*/{aspect}/{ALL}")
 
     def _fork(self, message: Fork) -> Refused | None:
         source, world = message.source, message.world

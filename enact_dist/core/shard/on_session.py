@@ -152,7 +152,7 @@ class SessionDesk:
 
     def on_register(self, message: Register, reply_to: int) -> Iterator[Effect]:
         """Create world contexts and register aspects, all or none."""
-        catalogue = self._state.catalogue
+        catalogue, guard = self._state.catalogue, self._state.guard
         if self._state.sessions.known(message.session) is None:
             yield Reply(reply_to, EpochChanged(self._state.epoch))
             return
@@ -167,7 +167,8 @@ class SessionDesk:
         records: list[Record] = [WorldRecord(name) for name in missing]
         for entry in message.aspects:
             wrong = wrong_aspect(entry)
-            registered = catalogue.register(entry) if wrong is None else wrong
+            alters = guard is None or not entry.reads or guard.may_alter(entry.name)
+            registered = catalogue.register(entry, alters=alters) if wrong is None else wrong
             if isinstance(registered, str):
                 registered = Refused("datum_type", registered)
             if isinstance(registered, Refused):
