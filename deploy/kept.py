@@ -23,7 +23,7 @@ from environment import PYTHON, ROOT, give_up, say
 
 REQUIREMENTS = ROOT / "deploy" / "requirements"
 WHEELS = ROOT / "deploy" / "wheels"
-LOCKS = ("build.txt", "core.txt", "record.txt", "perception.txt", "workcell.txt")
+LOCKS = ("build.txt", "core.txt", "record.txt", "keys.txt", "perception.txt", "workcell.txt")
 SUITE = "bookworm"
 BASE_TAG = f"enact-ci-base:{SUITE}"
 BASE_PACKAGES = "python3,python3-pip,python3-venv,ca-certificates,usr-is-merged"

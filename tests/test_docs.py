@@ -260,6 +260,32 @@ def test_modules_that_a_text_names_are_there():
     assert [(file, names) for file, names in lost if names] == []
 
 
+def lost_tests(text):
+    """Return the tests that the rows of a table name behind a file and that it does not have."""
+    lost, file = [], ""
+    for row in (line for line in text.splitlines() if line.startswith("| ")):
+        for named in re.findall(r"`([\w/]*\btest_\w+(?:\.py)?)`", row):
+            if named.endswith(".py"):
+                file = named
+            elif not (ROOT / "tests" / file).is_file() or not has_test(file, named):
+                lost.append(f"{file}::{named}")
+    return lost
+
+
+def has_test(file, name):
+    """Say whether a test module has a test of this name."""
+    return f"\ndef {name}(" in (ROOT / "tests" / file).read_text("utf-8")
+
+
+def test_tests_that_the_page_on_the_proof_names_are_there():
+    """Each attack with what shows its end: a test that is renamed or gone is found."""
+    text = (ROOT / "enact_dist" / "docs" / "proof.md").read_text("utf-8")
+    assert lost_tests(text) == []
+    assert len(re.findall(r"`test_\w+`", text)) >= 50
+    gone = "| x | y | `core/test_rights.py`: `test_gone`; `core/test_none.py`: `test_x` |"
+    assert lost_tests(gone) == ["core/test_rights.py::test_gone", "core/test_none.py::test_x"]
+
+
 def test_a_module_that_has_gone_is_found():
     """By its path, by its dotted name and by its file; data, methods and blocks are left alone."""
     text = "`core/multilock`, `core.state.causes.Cause`, `lock_judge.py`, `cell.toml`, `lock.end`"

@@ -16,7 +16,7 @@ LAYERS = (
     ("comparing", "patterns", "retention"),
     ("terms",),
     ("core.protocol",),
-    ("core.rights",),
+    ("core.failover", "core.rights"),
     ("core.state",),
     ("core.client", "core.offline", "core.shard"),
     ("wire",),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from difflib import SequenceMatcher
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from enact_dist.actor.uses import declared_rights
@@ -16,12 +18,15 @@ from enact_dist.core.rights.rules import data_path
 from enact_dist.patterns import patterns_overlap
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from enact_dist.actor.uses import ActorDeclaration
     from enact_dist.config.rights import AllowTable
     from enact_dist.config.types import CellConfig
+    from enact_dist.core.rights.rules import Rights
 
+SIMILAR: Final = 0.7
+"""From here on (0 to 1) the names of data are similar."""
 _MEANS: Final = {key: "read" if key == "read" else "write" for key in DATA_LISTS}
 """What an actor has to declare for a key of a rule to be of use."""
 
@@ -82,13 +87,35 @@ def _missing(config: CellConfig, declared: Sequence[AllowTable]) -> Iterator[Rig
         }
         if any(lacks.values()):
             lines = [f"{key} = {array_of(found)}" for key, found in lacks.items() if found]
+            near = _closest(config.rights.allow, rights, name, lacks)
             text = f'[[rights.allow]]\nwho = "{name}"\n' + "\n".join(lines)
             yield RightsFinding(
                 "right missing",
                 name,
-                f"actor {name} declares data that no rule gives to it; add to"
+                f"actor {name} declares data that no rule gives to it{near}; add to"
                 f" {config.path.name}:\n{text}",
             )
+
+
+def _closest(
+    rules: Sequence[AllowTable], rights: Rights, name: str, lacks: Mapping[str, Sequence[str]]
+) -> str:
+    """Return which rule comes closest to giving an actor what it lacks; "" if none does.
+
+    A rule for this actor that gives some of it comes before one for other names, and both before
+    one for data of a similar name.
+    """
+    found = []
+    for number, rule in enumerate(rules, 1):
+        own = any(rights.means(who, name) for who in rule.who)
+        for key, needs in _MEANS.items():
+            for one, path in itertools.product(getattr(rule, key), lacks[needs]):
+                near = patterns_overlap(data_path(one), data_path(path))
+                alike = SequenceMatcher(None, one, path).ratio()
+                if near or alike >= SIMILAR:
+                    text = f"rule {number} gives {key} of {one} to {', '.join(rule.who)}"
+                    found.append((near and own, near, own, alike, text))
+    return f" ({max(found)[-1]})" if found else ""
 
 
 def _unused(config: CellConfig, declared: Sequence[AllowTable]) -> Iterator[RightsFinding]:

@@ -74,7 +74,8 @@ VERBS: Final = (
         "enact verify --recovery\n"
         "enact verify --chaos --minutes 5\n"
         "enact verify --floods --json\n"
-        "enact verify --frames --minutes 10",
+        "enact verify --frames --minutes 10\n"
+        "enact verify --takeover --minutes 10",
         (
             *_SIMULATION,
             _RECOVERY,
@@ -84,6 +85,9 @@ VERBS: Final = (
                  "send every kind of message to the core and the store, with hostile values in"
                  " each field (default: for one minute; see --seconds, --minutes, --seeds,"
                  " --first, --seed)"),
+            flag("--takeover",
+                 "simulate shards in a replicated database, each with a standby daemon, and the"
+                 " faults of both (see --seeds, --first, --seconds, --minutes, --jobs, --seed)"),
             flag("--json", "print one JSON object"),
         ),
     ),
@@ -104,6 +108,10 @@ def run_verify(options: argparse.Namespace) -> int:
         from enact_dist.verify.frames import command as frames
 
         return frames.run(options)
+    if options.takeover:
+        from enact_dist.verify.takeover import command as takeover
+
+        return takeover.run(options)
     if options.recovery:
         from enact_dist.verify import recovery
 

@@ -37,6 +37,7 @@ from enact_dist.core.protocol.messages import (
     Prepare,
     Refused,
     Stage,
+    Staged,
 )
 from enact_dist.core.protocol.records import (
     Compare,
@@ -55,7 +56,7 @@ from enact_dist.core.state.clock import state_of
 from enact_dist.errors import StoreError
 from enact_dist.link.clock import Clock, SystemClock
 from enact_dist.link.host_figures import Stalls, figures_of, latencies_of
-from enact_dist.link.lease import Silence
+from enact_dist.link.lease import AnswerGate
 from enact_dist.link.memory.payload_desk import PayloadDesk, half_of, names_payloads
 from enact_dist.link.memory.use_marks import mark_uses
 from enact_dist.link.signals import Uninterrupted
@@ -140,7 +141,7 @@ class ShardHost:
         if store is None:
             shard.keep_nothing()
         self._store_thread = self._start_store(store) if store is not None else None
-        self.silence = Silence.of(store, self.count, self._fail)
+        self.silence = AnswerGate.of(store, self.count, self._fail)
         self._stalls = Stalls(self.name, self.count)
         self._timer = threading.Thread(target=self._keep_time, name="enact-timer", daemon=True)
         self._timer.start()
@@ -200,9 +201,8 @@ class ShardHost:
     ) -> None:
         """Pass a request to the shard; `reply` is called once, now or later, from any thread.
 
-        If the host ends or fails first, `reply` is never called: no answer means *unknown*.
-        `identity` is the sender as the transport knows it ("": this process), `subject` the one
-        whose rights it uses (None: the transport vouches for no name).
+        If the host ends first, `reply` is never called: no answer means *unknown*.  `identity` is
+        the sender ("": this process), `subject` whose rights it uses (None: no name is proven).
         """
         kind = type(message)
         if kind is Commit or kind is Prepare:
@@ -239,13 +239,15 @@ class ShardHost:
     ) -> None:
         if self._ended:
             return
-        refusal = self._refusal(message, identity)
-        if message.total and message.session not in self._shard.state.sessions.by_id:
-            refusal = refusal or EpochChanged(self.epoch)
-        if refusal is None and self.rights is not None:
+        file = message.file
+        answer: Answer | None = self._refusal(message, identity)
+        if answer is None and message.session not in self._shard.state.sessions.by_id:
+            # Drafts end with their session; the name of an unknown one takes no place.
+            answer = EpochChanged(self.epoch) if message.total else Staged(file, 0, shared=False)
+        if answer is None and self.rights is not None:
             with self._mutex:
-                refusal = self._shard.denied(message, identity, subject)
-        reply(refusal or self._payloads.stage(message, identity))
+                answer = self._shard.denied(message, identity, subject)
+        reply(answer or self._payloads.stage(message, identity))
 
     def _refusal(self, message: Request, identity: str) -> Refused | EpochChanged | None:
         """Return why the shard will refuse a message because of its sender, else None."""
@@ -341,7 +343,6 @@ class ShardHost:
     def _handle_now(
         self, message: Request | Event, handle: int, identity: str, subject: str | None
     ) -> None:
-        clock = self._clock
         later: list[Publish | Story] = []
         try:
             effects = self._shard.handle(
@@ -349,8 +350,8 @@ class ShardHost:
                 reply_to=handle,
                 identity=identity,
                 subject=subject,
-                now_ns=clock.monotonic_ns(),
-                wall_ns=clock.wall_ns(),
+                now_ns=self._clock.monotonic_ns(),
+                wall_ns=self._clock.wall_ns(),
             )
             for effect in self.silence.passing(effects) if self.silence else effects:
                 if isinstance(effect, Reply):  # answers first, since clients wait for them

@@ -1,9 +1,6 @@
-"""How long a shard in a database may answer, and what it keeps back afterwards.
+"""The lease of a shard in a database by this host's clock, and the gate through which answers go.
 
-The fence of the database keeps a daemon that has lost its shard from writing.  Its answers come
-from memory, so it must fall silent by itself, before another daemon can serve: it may answer until
-the *send time* of its last confirmed batch or renewal plus the lease, less the drift of two clocks.
-Only monotonic clocks count.
+`core.failover.lease` decides.
 """
 
 from __future__ import annotations
@@ -12,8 +9,8 @@ import logging
 import time
 from typing import TYPE_CHECKING, Final, Protocol
 
+from enact_dist.core.failover.lease import Lease, Silence, kept_ns
 from enact_dist.core.protocol.messages import Refused
-from enact_dist.core.protocol.records import Persist, Story
 from enact_dist.errors import StoreError
 from enact_dist.terms import Durability
 
@@ -24,12 +21,8 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.records import Effect
     from enact_dist.core.shard.state import ShardState
 
-DRIFT: Final = 0.02
-"""How much two monotonic clocks may differ: the holder counts less, who waits counts more."""
 DATABASE_BODY_BYTES_MAX: Final = 256 << 20
 """Largest body of a datum that a database takes."""
-_STAY: Final = (Persist, Story)
-"""Effects that reach no client and no other shard."""
 _log = logging.getLogger("enact.shard")
 
 
@@ -37,8 +30,8 @@ class ShardTakenError(StoreError):
     """Another process has the shard: this one must end and answer nothing more."""
 
 
-class Lease:
-    """How long this process may answer for its shard.  Thread-safe.
+class HostLease:
+    """A `Lease` by a clock of this host.  Thread-safe.
 
     Args:
         lease_s: Its length.
@@ -46,40 +39,42 @@ class Lease:
 
     Attributes:
         usable_s: How long it holds after a write was sent.
-        held_until_s: When it ends, on that clock.
     """
 
     def __init__(self, lease_s: float, now_s: Callable[[], float] = time.monotonic) -> None:
-        self.lease_s = lease_s
-        self.usable_s = lease_s * (1 - DRIFT)
-        self.held_until_s = 0.0
+        self.lease = Lease(round(lease_s * 1e9))
+        self.usable_s = kept_ns(self.lease.lease_ns) / 1e9
         self._now_s = now_s
 
     @property
     def holds(self) -> bool:
         """Whether no other process can serve the shard yet."""
-        return self._now_s() < self.held_until_s
+        return self.lease.holds(self.now_ns())
 
     @property
     def left_s(self) -> float:
         """How long it still holds; below 0: it has ended."""
-        return self.held_until_s - self._now_s()
+        return self.lease.until_ns / 1e9 - self._now_s()
 
     def now_s(self) -> float:
         """Return the time, to be taken before a write is sent."""
         return self._now_s()
 
+    def now_ns(self) -> int:
+        """Return the time in ns."""
+        return int(self._now_s() * 1e9)
+
     def confirmed(self, sent_s: float) -> None:
         """Take note that a write which was sent at `sent_s` is confirmed."""
         # Two threads may do this at once: the lesser time does no harm.
-        self.held_until_s = max(self.held_until_s, sent_s + self.usable_s)
+        self.lease.confirmed(int(sent_s * 1e9))
 
 
 class Holding(Protocol):
     """A shard that this process holds for as long as it renews its lease."""
 
     @property
-    def lease(self) -> Lease:
+    def lease(self) -> HostLease:
         """How long this process may answer."""
 
     def on_failure(self, failed: Callable[[Exception], None]) -> None:
@@ -97,10 +92,9 @@ class HeldStore(Protocol):
         """For how long this process holds the shard; None: until its end."""
 
 
-class Silence:
-    """Keeps back effects that leave the process while the lease has ended.
+class AnswerGate:
+    """Lets answers out while the lease holds, see `Silence`; logs and counts when it does not.
 
-    Once it is renewed in the same epoch they go out, in order: no other process can have written.
     Not thread-safe, but for `end_soon`.
     """
 
@@ -108,8 +102,7 @@ class Silence:
         self.end_soon = holding.end_soon
         self._lease = holding.lease
         self._count = count
-        self._kept: list[Effect] = []
-        self._silent = False
+        self._silence = Silence(holding.lease.lease)
 
     @property
     def holds(self) -> bool:
@@ -122,8 +115,8 @@ class Silence:
         store: HeldStore | None,
         count: Callable[[str], None],
         failed: Callable[[Exception], None],
-    ) -> Silence | None:
-        """Return the silence of a store's lease; None: it needs none, for it is held to its end.
+    ) -> AnswerGate | None:
+        """Return the gate of a store's lease; None: it needs none, for it is held to its end.
 
         Args:
             store: The store.
@@ -154,19 +147,17 @@ class Silence:
 
     def passing(self, effects: Sequence[Effect]) -> Sequence[Effect]:
         """Return the effects to perform now, those kept back before them."""
-        if self._lease.holds:
-            if not self._silent:
-                return effects
-            kept, self._kept, self._silent = self._kept, [], False
-            _log.warning("the lease is renewed: %d answers that waited go out", len(kept))
-            return [*kept, *effects]
-        if not self._silent:
-            self._silent = True
+        was_silent = self._silence.since_ns
+        passing = self._silence.passing(effects, self._lease.now_ns())
+        if was_silent and not self._silence.since_ns:
+            _log.warning(
+                "the lease is renewed: %d answers that waited go out", len(passing) - len(effects)
+            )
+        elif self._silence.since_ns and not was_silent:
             self._count("silences")
             _log.warning(
                 "the database has confirmed nothing for %.1f s, so another daemon may take the"
                 " shard over: answers wait",
                 self._lease.usable_s - self._lease.left_s,
             )
-        self._kept += [effect for effect in effects if not isinstance(effect, _STAY)]
-        return [effect for effect in effects if isinstance(effect, _STAY)]
+        return passing

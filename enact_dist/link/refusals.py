@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.client.lock import MultiLock
 from enact_dist.core.client.plan import Phase
-from enact_dist.core.protocol.messages import Forgotten, Refused
-from enact_dist.core.shard.owners import PERMISSION
+from enact_dist.core.protocol.messages import PERMISSION, Forgotten, Refused
 from enact_dist.core.state.grants import HELD_TOO_LONG
 from enact_dist.errors import (
     ChangedError,

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.core.protocol.messages import Survey
@@ -89,6 +90,7 @@ class Looks:
         self._shards: dict[str, ShardInfo] = {}
         self._first: dict[str, tuple[int, Mapping[str, int]]] = {}
         self._away_unix_s: dict[str, float] = {}
+        self._infos: tuple[ActorInfo, ...] = ()
         self._sessions: dict[str, str] = {}
         self._restarts: dict[str, int] = {}
         self._events: deque[tuple[float, str]] = deque(maxlen=EVENTS_MAX)
@@ -104,20 +106,22 @@ class Looks:
         for shard in look.shards:
             self._note_shard(shard, look.unix_s)
         self._note_actors(look)
+        unheard = self._unheard(look)
+        actors = [*self._actors(look.actors), *self._actors(unheard, "away")]
         rates = CellRates(
             look.unix_s,
             look.unix_s - self._last.unix_s if self._last is not None else 0.0,
             look.took_s,
             tuple(self._shard(shard, look, spans_s.get(shard.name)) for shard in look.shards),
             tuple(sorted(self._counters(look, spans_s), key=lambda one: not one.remedy)),
-            tuple(self._actors(look)),
+            tuple(actors),
             look.locks,
             self._rows,
             self._slots_unix_s,
             tuple(self._events),
         )
         self._shards.update({shard.name: shard for shard in look.shards if shard.reachable})
-        self._last = look
+        self._last, self._infos = look, (*look.actors, *unheard)
         return rates
 
     # ---------------------------------------------------------------- what happens
@@ -160,12 +164,17 @@ class Looks:
             for name, one in shards.items()
             if name in before and before[name].epoch == one.epoch
         }
+        away = {shard.name for shard in look.shards if not shard.reachable}
         kept = {
             slot: info
             for slot, info in self._slots.items()
-            if info.shard in look.unlisted and slot not in look.slots
+            if info.shard in away.union(look.unlisted) and slot not in look.slots
         }
-        rows = [one for one in self._rows if (one.world, one.entity, one.aspect) in kept]
+        rows = [
+            replace(one, hz=None, bytes_s=None, away=True) if one.shard in away else one
+            for one in self._rows
+            if (one.world, one.entity, one.aspect) in kept
+        ]
         self._rows = (*rows, *self._data(look, look.slots, spans_s))
         self._slots = {**kept, **look.slots}
         self._written, self._slots_unix_s = _Written(self._rows), look.unix_s
@@ -242,9 +251,19 @@ class Looks:
                         shard.name, name, hz, moved, total, known.meaning, known.remedy
                     )
 
-    def _actors(self, look: Look) -> Iterator[ActorRates]:
-        for info in look.actors:
-            reports = _reports(info)
+    def _unheard(self, look: Look) -> list[ActorInfo]:
+        """Return the sessions that no other shard knows than those which are away."""
+        away = {shard.name for shard in look.shards if not shard.reachable}
+        heard = {info.session for info in look.actors}
+        return [
+            info
+            for info in self._infos
+            if info.session not in heard and info.shards and away.issuperset(info.shards)
+        ]
+
+    def _actors(self, infos: Iterable[ActorInfo], lost: str = "") -> Iterator[ActorRates]:
+        for info in infos:
+            reports, state = _reports(info), lost or ("silent" if info.silent else "")
             session: dict[str, Any] = {
                 "host": info.host,
                 "pid": info.pid,
@@ -252,14 +271,13 @@ class Looks:
                 "locks": info.locks,
             }
             if not reports:
-                state = "silent" if info.silent else "connected"
-                yield ActorRates(info.actor, state=state, **session)
+                yield ActorRates(info.actor, state=state or "connected", **session)
             for report in reports:
                 name = str(report["name"])
                 yield ActorRates(
                     name,
-                    state="silent" if info.silent else str(report.get("state", "")),
-                    runs_hz=None if info.silent else _number(report, "rate_hz"),
+                    state=state or str(report.get("state", "")),
+                    runs_hz=None if state else _number(report, "rate_hz"),
                     wrote_age_s=self._written.age_s(report.get("writes")),
                     restarts=self._restarts.get(name, 0),
                     last_error=str(report.get("last_error", "")),

@@ -96,8 +96,9 @@ class ActorRates:
         name: Its name.
         host: Where it runs.
         pid: Its process there.
-        state: As it reports; "silent" if its lease is over, "connected" if it reports nothing.
-        runs_hz: Updates per second, over its last 5 s; None of a silent one.
+        state: As it reports; "silent" if its lease is over, "connected" if it reports nothing,
+            "away" if all shards that know it are: then all else is what was last known.
+        runs_hz: Updates per second, over its last 5 s; None of one that is silent or away.
         update_p50_ms: Median of its newest 512 updates, the wait for the lock left out.
         update_p99_ms: 99th percentile of the same.
         lock_wait_p99_ms: 99th percentile of its newest 512 waits for a lock.
@@ -149,6 +150,7 @@ class DatumRates:
         age_s: Time from the newest commit to the look that showed it.
         null_reason: Why it is null; empty if it is not.
         shard: The shard that stores it.
+        away: Whether that shard was away at that look; then all else is what was last known.
     """
 
     world: str
@@ -161,6 +163,7 @@ class DatumRates:
     age_s: float
     null_reason: str
     shard: str
+    away: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -92,6 +92,11 @@ class Recorded:
     pid: int = 0
 
     @property
+    def state(self) -> tuple[int, int]:
+        """Return version and stamp, which no other state of the slot has."""
+        return self.version, self.stamp_ns
+
+    @property
     def captured_ns(self) -> int:
         """Return when the datum was captured, 0 where that is not known."""
         return self.datum.stamp_ns if self.datum is not None else 0

@@ -85,10 +85,11 @@ class SlotCatalogue:
         """
         with self._guard:
             self._worlds = tuple(worlds)
-            there = {slot.context for slot, state in self._states.items() if not state.null}
-            kept = there.union(self._worlds)
-            self._states = {slot: at for slot, at in self._states.items() if slot.context in kept}
-            self._by_world = {}
+            gone = {slot.context for slot in self._states}.difference(self._worlds)
+            if gone:
+                states = self._states.items()
+                gone -= {slot.context for slot, at in states if not at.null}
+                self._states = {slot: at for slot, at in states if slot.context not in gone}
 
     def note(self, slot: Slot, state: ListedState, *, gap: int, now_s: float) -> None:
         """Take a change; the first one of a slot is no change of it."""

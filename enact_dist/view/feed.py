@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 AGAIN_S: Final = 1.0
 """Pause before a watch that failed is opened again."""
+GATHER_S: Final = 0.02
+"""How long changes are collected after the first one: a thread that wakes for each costs more."""
 NAMED_MAX: Final = 3
 """Most data that cannot be shown whose reasons are."""
 PROBED_MAX: Final = 16
@@ -152,7 +154,16 @@ class Feed(Follower):
             self._take(watch, max(0.0, due_s - time.monotonic()))
 
     def _take(self, watch: Watch, wait_s: float) -> None:
-        change = watch.next(wait_s)
+        until_s = time.monotonic() + wait_s
+        if self._noted(watch, wait_s):
+            left_s = max(0.0, until_s - time.monotonic())
+            with self._news:
+                self._news.wait_for(lambda: self._stopped, min(GATHER_S, left_s))
+            self._noted(watch, 0.0)
+
+    def _noted(self, watch: Watch, wait_s: float) -> bool:
+        """Note a change and those that came with it; return whether there was one."""
+        first = change = watch.next(wait_s)
         now_s = time.monotonic()
         while change is not None:
             slot = Slot(change.world, change.entity.name, change.aspect)
@@ -161,6 +172,7 @@ class Feed(Follower):
             )
             self.catalogue.note(slot, state, gap=change.gap, now_s=now_s)
             change = watch.next_here()
+        return first is not None
 
     def _round(self, now_s: float) -> None:
         """Fetch what has changed."""
@@ -189,7 +201,7 @@ class Feed(Follower):
             return False
         if shown is None:
             return not state.null
-        return (shown.recorded.version, shown.recorded.stamp_ns) != state[:2]
+        return shown.recorded.state != state[:2]
 
     def _probes(self) -> list[Slot]:
         """Return one datum of each aspect whose kinds have to be guessed."""
@@ -256,7 +268,7 @@ class Feed(Follower):
         try:
             shown = shown_of(recorded, self.shows_of(slot.aspect))
         except Exception as error:  # noqa: BLE001 - one odd datum takes no other with it
-            self._unfit[slot] = (recorded.version, recorded.stamp_ns), str(error) or repr(error)
+            self._unfit[slot] = recorded.state, str(error) or repr(error)
             return
         self._unfit.pop(slot, None)
         if not shown.shows.kinds and recorded.datum is not None:

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeVar
 
-from enact_dist.access.asking import answers_to, explained, in_parts
+from enact_dist.access.asking import expected, explained, in_parts
 from enact_dist.access.snapshot import HeldView
 from enact_dist.core.protocol.datum import Slot
-from enact_dist.core.protocol.messages import Item, ListHistory, Ping, SlotVersion, Versions
+from enact_dist.core.protocol.messages import (
+    PERMISSION,
+    Item,
+    ListHistory,
+    Ping,
+    Refused,
+    SlotVersion,
+    Versions,
+)
 from enact_dist.errors import (
     ForgottenError,
     LeaseLostError,
@@ -203,25 +210,25 @@ class CellSource:
         items = [Item(int(Access.VIEW), *slot) for slot in slots]
         with HeldView(self.session, items, past_ns=at_ns) as view:
             found: dict[Slot, Recorded] = {}
-            for shard, _, state in view.states:
+            new = []
+            for reading in view.states:
+                state = reading.state
                 known = before.get(state.slot)
-                version = (state.version, state.stamp_ns)
-                if known is not None and (known.version, known.stamp_ns) == version:
+                if known is not None and known.state == (state.version, state.stamp_ns):
                     found[state.slot] = known
                 else:
-                    facts = (state.slot, *version, shard, 0)
-                    found[state.slot] = Recorded(*facts, None, state.null_reason)
-            new = [
-                one
-                for one in view.states
-                if found[one.state.slot].datum is None and not one.state.null_reason
-            ]
-            for slot, datum in view.fetch(new).items():
-                found[slot] = replace(found[slot], datum=datum)
+                    new.append(reading)
+            data = view.fetch([one for one in new if not one.state.null_reason])
+            for shard, _, state in new:
+                facts = (state.slot, state.version, state.stamp_ns, shard, 0)
+                found[state.slot] = Recorded(*facts, data.get(state.slot), state.null_reason)
             return found
 
     def histories(self, slots: Sequence[Slot]) -> Histories:
-        """Return which versions of these slots the shards that answer still know."""
+        """Return which versions of these slots the shards that answer still know.
+
+        Slots that this program may not read are left out; `data_at` names them.
+        """
         return self._of_those_there(slots, self._histories)
 
     def _histories(self, slots: Sequence[Slot]) -> Histories:
@@ -237,8 +244,10 @@ class CellSource:
             for entities in in_parts(each)
         ]
         found: Histories = {}
-        for _, answer in answers_to(client, Versions, calls):
-            for entry in answer.entries:
+        for answer in client.call_all(calls):
+            if isinstance(answer, Refused) and answer.code == PERMISSION:
+                continue  # asked about one slot alone; of several the shard leaves such ones out
+            for entry in expected(Versions, ListHistory, answer).entries:
                 state = entry.state
                 if state.slot in wanted and state.version:
                     found.setdefault(state.slot, []).append((state.version, state.stamp_ns))

@@ -77,7 +77,8 @@ def connect(
     keys = client_keys(known.security, client.actor)
     if keys is not None:
         client.actor = actor_said(keys.name, client.actor)
-        client.session = session_of(keys.name)
+    secret = secrets.token_hex(16)
+    client.session = session_of(keys.name if keys is not None else client.actor, secret)
     cell_name, cell_client, welcome = join(
         known.name,
         known.endpoints,
@@ -87,6 +88,7 @@ def connect(
         carrier=known.carrier,
         expected=known.expected,
         keys=keys,
+        secret=secret,
     )
     cell_client.request_timeout_s = request_timeout_s
     try:

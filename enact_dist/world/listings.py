@@ -6,9 +6,10 @@ import time
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final
 
-from enact_dist.access.asking import answers_to, ask_all
+from enact_dist.access.asking import answers_to, ask_all, expected
 from enact_dist.core.protocol.messages import (
     NO_LIMIT,
+    PERMISSION,
     Audited,
     ListAudit,
     ListLocks,
@@ -22,7 +23,6 @@ from enact_dist.core.protocol.messages import (
     Surveyed,
     Welcome,
 )
-from enact_dist.core.shard.owners import PERMISSION
 from enact_dist.core.state.retention import limits_of
 from enact_dist.errors import LinkError
 from enact_dist.link.refusals import error_of
@@ -287,7 +287,7 @@ def settle_alarms(client: CellClient, shard: str, how: str) -> None:
     """Acknowledge all alarms of a shard so far."""
     ((_, seen),) = ask_all(client, Audited, ListAudit(""), (shard,))
     newest_ns = max((entry.wall_ns for entry in seen.entries), default=0)
-    client.call(shard, ListAudit(how, newest_ns))
+    expected(Audited, ListAudit, client.call(shard, ListAudit(how, newest_ns)))
 
 
 def refusal_infos(client: CellClient, shards: Iterable[str] | None) -> tuple[RefusalInfo, ...]:

@@ -175,6 +175,21 @@ def test_actor_row_has_what_it_reports_and_the_age_of_what_it_wrote():
     assert (d.name, d.state, d.runs_hz) == ("d", "connected", None)
 
 
+def test_actor_is_away_with_all_its_shards():
+    """One that a shard still knows is as that shard says, or has gone."""
+    looks, infos = Looks(), [actor(rate_hz=10.0), actor("arm", "s2", shards=("left", "right"))]
+    right = shard("right", uptime_s=1.0)
+    looks.add(Look(T0_S, shards=(shard(uptime_s=1.0), right), actors=(*infos,)))
+    gone = [looks.add(Look(T0_S + n, shards=(away(), right), actors=())) for n in (1, 2)]
+    back = looks.add(Look(T0_S + 3, shards=(shard(uptime_s=4.0), right), actors=(infos[0],)))
+
+    for rates in gone:
+        assert [(one.name, one.state, one.runs_hz) for one in rates.actors] == [
+            ("camera", "away", None)
+        ]
+    assert [(one.name, one.state) for one in back.actors] == [("camera", "running")]
+
+
 def test_silent_actor_has_no_rate():
     """Its last report describes an earlier time."""
     (row,) = Looks().add(Look(T0_S, actors=(actor(left_s=-2.0, rate_hz=10.0),))).actors
@@ -183,7 +198,7 @@ def test_silent_actor_has_no_rate():
 
 
 def test_slots_change_by_their_versions():
-    """A slot that was not there before has no rate yet; one of a shard that is away is missing."""
+    """A slot that was not there before has no rate yet; one of a shard that is away has none."""
     looks = Looks()
     looks.add(Look(T0_S, shards=(shard(uptime_s=1.0),), slots=slots(a=10)))
     looks.add(Look(T0_S, shards=(shard(uptime_s=3.0),), slots=slots(a=30, b=5)))
@@ -257,6 +272,22 @@ def test_slots_that_a_shard_does_not_list_stay_as_they_were():
     text = "shard left does not list its slots, so the last known are shown: no answer"
     assert cut.events == back.events == ((T0_S + 1.0, text),)
     assert [(one.entity, one.hz) for one in back.data] == [("camera/a", 5.0), ("camera/b", 0.0)]
+
+
+def test_data_of_a_shard_that_is_away_stay_and_say_so():
+    looks, right = Looks(), slots("right", b=5)
+    there = looks.add(Look(T0_S, shards=(shard(uptime_s=1.0), shard("right", uptime_s=1.0)),
+                           slots=slots(a=10) | right))  # fmt: skip
+    gone = looks.add(Look(T0_S + 1, shards=(away(), shard("right", uptime_s=2.0)), slots=right))
+    back = looks.add(Look(T0_S + 3, shards=(shard(uptime_s=4.0), shard("right", uptime_s=4.0)),
+                          slots=slots(a=16) | right))  # fmt: skip
+
+    def rows(rates):
+        return [(one.entity, one.version, one.hz, one.away) for one in rates.data]
+
+    assert [away for *_, away in rows(there)] == [False, False]
+    assert rows(gone) == [("camera/a", 10, None, True), ("camera/b", 5, 0.0, False)]
+    assert rows(back) == [("camera/a", 16, 2.0, False), ("camera/b", 5, 0.0, False)]
 
 
 def test_look_names_a_shard_that_does_not_list_its_slots(monkeypatch):

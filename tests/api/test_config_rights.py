@@ -243,7 +243,9 @@ def test_missing_and_unused_rights_are_found(tmp_path, capsys, monkeypatch):
 
     assert main(check) == 1
     told = capsys.readouterr().out
-    assert "error: right missing: actor arm declares data that no rule gives to it" in told
+    said = "error: right missing: actor arm declares data that no rule gives to it"
+    closest = "rule 2 gives change of online:pallet/joints to arm"
+    assert f"{said} ({closest}); add to cell.toml:" in told
     assert "gives change of online:pallet/joints to arm, and none of them declares it" in told
     assert told.count("right unused") == 1
     pasted = told[told.index("[[rights.allow]]\nwho = ") :].partition("warning:")[0]

@@ -1,6 +1,6 @@
 """One client floods a shard: another's updates stay exact, and the flood is refused by name.
 
-This is a sample; `enact verify --floods` runs all of them, beside 3,000 updates over each carrier.
+Each run takes a sample; `enact verify --floods` runs all, beside 3,000 updates over each carrier.
 What each of them did to a shard without bounds, `enact_dist.verify.floods.attacks` says.
 """
 
@@ -10,6 +10,8 @@ from enact_dist.verify.floods.attacks import ATTACKS, Attack
 from enact_dist.verify.floods.run import Figures, judge, judge_attacker, measure
 
 UPDATES = 300
+LEFT_OUT = ("nothing", "socket sessions")
+"""The honest client has done so many before 256 connections are open: the one at which it ends."""
 P99_MS_MAX = 2000.0
 """Far above the 10 ms of an idle machine, and far below what each of these floods did before."""
 
@@ -25,16 +27,9 @@ def seen(**found):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "carrier"),
-    [
-        ("parked questions", "zenoh"),
-        ("registrations", "zenoh"),
-        ("long questions", "zenoh"),
-        ("forged socket sessions", "socket"),
-        ("stranger as a client", "zenoh"),
-    ],
-)
+@pytest.mark.sampled(5)
+@pytest.mark.parametrize("carrier", ["socket", "zenoh"])
+@pytest.mark.parametrize("name", [one.name for one in ATTACKS if one.name not in LEFT_OUT])
 def test_updates_stay_exact_beside_a_flood_that_is_refused(name, carrier):
     """Each update counts once, nobody's lock is lost, and the shard starts on its folder again."""
     figures = measure(flood(name), carrier=carrier, updates=UPDATES)

@@ -1,34 +1,23 @@
-"""The tools in a cell with rights: what a name may not see is refused by name, never shown as null.
-
-`reader` may read a part and observe, `blind` may do nothing.
-"""
+"""The tools in a cell with rights: what a name may not see is refused by name, never shown as null."""
 
 import pytest
 
 pytest.importorskip("cryptography", reason="making keys needs the extra 'keys'")
 
-import sys
+import contextlib
+import logging
 import threading
-from pathlib import Path
+from concurrent.futures import ThreadPoolExecutor
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "link"))
-
-import key_cells
+from rights_cells import guarded_cell
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
 from enact_dist.cli.main import main
+from enact_dist.errors import LeaseLostError
 
+COUNT = Aspect("count", int)
 pytestmark = pytest.mark.carrier("zenoh")
 
-RIGHTS = """
-[rights]
-default = "none"
-programs = ["reader", "blind"]
-observe = ["reader"]
-[[rights.allow]]
-who = "reader"
-read = "online:open/**"
-"""
 OBSERVING = (["top", "--once"], ["actor", "ls"], ["lock", "ls"], ["lock", "audit"], ["shard", "ls"])
 SECRET = (
     ["why", "online", "secret/x/count"],
@@ -40,11 +29,11 @@ SECRET = (
 @pytest.fixture(scope="module")
 def cell(tmp_path_factory):
     """A running cell with a datum that `reader` may read, and one that it may not."""
-    cell = key_cells.KeyCell(tmp_path_factory.mktemp("cell"), more=RIGHTS)
+    cell = guarded_cell(tmp_path_factory.mktemp("cell"))
     with cell.running():
         with connect(cell.file, actor="ada") as ada:
             for name in ("open/x", "secret/x"):
-                write = Write(ada.world("online"), Entity(name), Aspect("count", int))
+                write = Write(ada.world("online"), Entity(name), COUNT)
                 with Lock(write) as lock:
                     lock[write] = 1
         yield cell
@@ -93,11 +82,10 @@ def test_a_recording_has_what_is_readable_and_names_the_rest(cell, tmp_path, mon
     from enact_dist.recording import Recorder
     from enact_dist.recording.summary import DENIED
 
-    count = Aspect("count", int)
     monkeypatch.setenv("ENACT_IDENTITY", "reader")
     with connect(cell.file) as reader, connect(cell.file, actor="ada") as ada:
         writes = [
-            Write(ada.world("online"), Entity(name), count) for name in ("open/x", "secret/x")
+            Write(ada.world("online"), Entity(name), COUNT) for name in ("open/x", "secret/x")
         ]
 
         def write():
@@ -114,3 +102,60 @@ def test_a_recording_has_what_is_readable_and_names_the_rest(cell, tmp_path, mon
     assert (summary.initial, summary.versions) == (1, 3)
     assert summary.gaps == {DENIED: 2}
     assert summary.gap_slots == {"online:secret/x/count": 2}
+
+
+# ---------------------------------------------------------------- acts by hand
+
+BY_HAND = {
+    "break": ["lock", "break", "NUMBER", "--shard", "left", "--reason", "camera unplugged"],
+    "resolve": ["lock", "resolve", "--force-abort", "NUMBER", "--shard", "left", "--reason", "x"],
+    "resolve ": ["lock", "audit", "--acknowledge", "mended", "--shard", "left"],
+    "drop": ["world", "drop", "spare"],
+}
+"""Commands that change a cell, by the right that each needs."""
+
+
+@contextlib.contextmanager
+def held(cell):
+    """Fork a world context and yield the number of a lock, which may be broken meanwhile."""
+    online = cell.world("online")
+    online.fork("spare")
+    with contextlib.suppress(LeaseLostError), Lock(Write(online, Entity("x"), COUNT)):
+        yield cell.locks()[0].number
+
+
+@pytest.mark.carrier("auto")
+@pytest.mark.parametrize("way", ["zenoh", "socket"])
+def test_acts_by_hand_need_their_right_and_leave_a_name(tmp_path, way, monkeypatch, capsys, caplog):
+    """A viewer's end with status 1 and change nothing; an operator's are done in its name."""
+    cell = guarded_cell(tmp_path, carrier=way)
+    caplog.set_level(logging.INFO, "enact")
+
+    def run(name, right, number):
+        monkeypatch.setenv("ENACT_IDENTITY", name)
+        words = [word.replace("NUMBER", str(number)) for word in BY_HAND[right]]
+        with ThreadPoolExecutor() as another:  # this thread holds a lock
+            status = another.submit(main, [*words, "--cell", str(cell.file)]).result()
+        return status, *capsys.readouterr()
+
+    with cell.running() as shard, connect(cell.file, actor="ada") as ada, held(ada) as number:
+        for right in BY_HAND:
+            status, out, error = run("reader", right, number)
+            assert (status, out) == (1, ""), right
+            assert f"enact: reader may not {right.strip()} " in error
+        assert len(ada.locks()) == 1
+        assert "spare" in ada.worlds()
+        assert ada.audit() == ()
+        refusals = {(one.identity, one.right): one.count for one in ada.refusals()}
+        assert refusals == {("reader", "break"): 1, ("reader", "resolve"): 2, ("reader", "drop"): 1}
+        assert shard.host.figures()["permission_denied"] == 4
+        for right in ("break", "resolve", "drop"):
+            assert f"reader may not {right} " in caplog.text
+
+        done = {right: run("ada", right, number) for right in BY_HAND}
+        assert [status for status, *_ in done.values()] == [0, 1, 0, 0]
+        assert "is not in doubt" in done["resolve"][2]
+        assert "spare" not in ada.worlds()
+        (entry,) = ada.audit()
+        assert (entry.kind, entry.identity.partition("@")[0]) == ("broken", "ada")
+        assert "drops world context 'spare'" in caplog.text

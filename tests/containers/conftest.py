@@ -1,5 +1,6 @@
 """An engine, and the images in it, for all tests of containers."""
 
+import functools
 import subprocess
 import sys
 from pathlib import Path
@@ -9,6 +10,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 
 from engine import ROOT, NoEngineError, start
+from stack import PACKAGES, judged
 
 
 @pytest.fixture(scope="session")
@@ -43,3 +45,23 @@ def build(option, engine):
         text=True,
         check=False,
     )
+
+
+@pytest.fixture(scope="session")
+def alone(tmp_path_factory):
+    """The palletizing cell on this machine, without containers; its report once it is done."""
+    out = tmp_path_factory.mktemp("alone")
+    run = "import pathlib, sys; from actors.palletizing.demo.run import run_demo"
+    run += "; sys.exit(run_demo(out=pathlib.Path(sys.argv[1]), packages=int(sys.argv[2])))"
+    with subprocess.Popen(
+        [sys.executable, "-c", run, str(out), str(PACKAGES)], stdout=subprocess.PIPE, text=True
+    ) as process:
+
+        @functools.cache
+        def report():
+            said, _ = process.communicate()
+            assert process.returncode == 0, said
+            return judged(out)
+
+        yield report
+        process.terminate()

@@ -111,3 +111,9 @@ def cell_file(folder):
         )
     )
     return file
+
+
+def judged(out):
+    """Return what was found at each place."""
+    packages = json.loads((out / "report.json").read_text("utf-8"))["packages"]
+    return [{**package, "frame_to_feedback_ms": 0.0} for package in packages]

@@ -4,16 +4,13 @@ One project for all of it: the conveyor is the last to start, so that the packag
 faults, and their verdicts are those of a run on one machine that had none.
 """
 
-import functools
 import json
-import subprocess
-import sys
 
 import pytest
 
 pytest.importorskip("open3d", exc_type=ImportError)
 
-from stack import PACKAGES, Stack, until
+from stack import PACKAGES, Stack, judged, until
 
 pytestmark = pytest.mark.containers
 
@@ -76,32 +73,6 @@ TAKE = """begun_s = time.monotonic()
     with Lock(write, wait_s=20.0) as lock:
         lock[write], taken_s = 10, time.monotonic()
     print(round(1e3 * (taken_s - begun_s)))"""
-
-
-@pytest.fixture(scope="module")
-def alone(tmp_path_factory):
-    """The same cell on this machine, without containers; its report once it is done."""
-    out = tmp_path_factory.mktemp("alone")
-    run = "import pathlib, sys; from actors.palletizing.demo.run import run_demo"
-    run += "; sys.exit(run_demo(out=pathlib.Path(sys.argv[1]), packages=int(sys.argv[2])))"
-    with subprocess.Popen(
-        [sys.executable, "-c", run, str(out), str(PACKAGES)], stdout=subprocess.PIPE, text=True
-    ) as process:
-
-        @functools.cache
-        def report():
-            said, _ = process.communicate()
-            assert process.returncode == 0, said
-            return judged(out)
-
-        yield report
-        process.terminate()
-
-
-def judged(out):
-    """Return what was found at each place."""
-    packages = json.loads((out / "report.json").read_text("utf-8"))["packages"]
-    return [{**package, "frame_to_feedback_ms": 0.0} for package in packages]
 
 
 @pytest.fixture(scope="module")

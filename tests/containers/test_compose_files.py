@@ -7,6 +7,7 @@ import pytest
 pytestmark = pytest.mark.containers
 
 ONE = ("--file", "deploy/compose.yaml")
+SECURE = (*ONE, "--file", "deploy/compose.secure.yaml")
 TWO = ("--env-file", "deploy/multihost.env", *ONE, "--file", "deploy/compose.multihost.yaml")
 
 
@@ -15,6 +16,7 @@ TWO = ("--env-file", "deploy/multihost.env", *ONE, "--file", "deploy/compose.mul
     [
         (ONE, 12),
         ((*ONE, "--profile", "tools"), 14),
+        (SECURE, 13),
         ((*ONE, "--profile", "workcell"), 32),
         ((*ONE, "--profile", "packing"), 31),
         ((*TWO, "--profile", "shards"), 5),
@@ -46,3 +48,22 @@ def test_a_cell_file_that_is_missing_is_told_by_its_name(engine):
         mounts = {mount["target"]: mount for mount in service["volumes"]}
         mount = mounts.get("/etc/enact/cell.toml", {})
         assert name == "folder" or not mount.get("bind", {}).get("create_host_path", False)
+
+
+def test_with_keys_each_container_mounts_one_key(engine):
+    """Its own, read-only; only what makes keys mounts the authority, and none shares memory."""
+    options = (*SECURE, "--profile", "tools", "config", "--format", "json")
+    services = json.loads(engine.compose(*options).stdout)["services"]
+    made = {mount["source"]: mount["target"] for mount in services.pop("keys")["volumes"]}
+
+    for name in ("folder", "workcell-enact"):
+        del services[name]
+    for name, service in services.items():
+        mounts = {mount["source"]: mount for mount in service["volumes"]}
+        (key,) = (mount for mount in mounts.values() if mount["target"] == "/keys")
+        owner = made[key["source"]].removeprefix("/hosts/")
+        assert owner == {"enact": "ada"}.get(name, name.replace("shard-", "shard.")), name
+        assert key["read_only"], name
+        assert mounts["cell"]["read_only"], name
+        assert not mounts.keys() & {"office", "shared"}, name
+        assert service["depends_on"]["keys"]["condition"] == "service_completed_successfully"

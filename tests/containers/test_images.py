@@ -8,7 +8,7 @@ from engine import ROOT
 
 pytestmark = pytest.mark.containers
 
-MEGABYTES_MAX = {"core": 300, "perception": 870, "workcell": 820}
+MEGABYTES_MAX = {"core": 300, "keys": 300, "perception": 870, "workcell": 820}
 BARE = ("run", "--rm", "--network", "none", "--read-only", "--cap-drop", "ALL", "--tmpfs", "/tmp")
 """A container without network, rights, or a place to write but /tmp."""
 
@@ -94,6 +94,13 @@ def test_an_image_misses_nothing_but_what_was_left_out(engine, images, target):
         set(re.findall(r"^[\w-]+", left_out, re.MULTILINE)) if target == "perception" else set()
     )
     assert missing or done.returncode == 0, done.stdout + done.stderr
+
+
+def test_only_the_image_that_makes_keys_has_what_makes_them(engine, images):
+    loads = "import cryptography; print('loaded')"
+
+    assert python(engine, "keys", loads).stdout == "loaded\n"
+    assert "No module named 'cryptography'" in python(engine, "core", loads).stderr
 
 
 def test_core_has_no_open3d(engine, images):

@@ -133,7 +133,7 @@ def test_this_process_and_operators_need_no_right():
 
 
 def test_a_name_without_proof_may_do_nothing_and_may_try_again():
-    """It may say hello, renew and leave; its refusal does not end an actor for good."""
+    """It may say hello and renew; its refusal does not end an actor for good."""
     bench = GuardedBench(read="online:**")
     handle = type(bench.shard).handle
     asked = handle(
@@ -144,6 +144,28 @@ def test_a_name_without_proof_may_do_nothing_and_may_try_again():
     (answer,) = [effect.answer for effect in asked if hasattr(effect, "answer")]
     assert answer.code == "unproven"
     assert "cam@h:1 asked to read online:piece/count over Zenoh" in answer.text
+
+
+def test_a_reader_changes_nothing_of_what_is_registered():
+    """It registers what it reads at every shard; one that may not write it alters no catalogue."""
+    bench = GuardedBench(read="online:**")
+    known, before = ASPECTS[0], bench.shard.state.catalogue.shown()
+    new = known._replace(name="new", reads=True)
+    more = known._replace(reads=True, retention=known.retention + 9)
+    log = len(bench.log)
+
+    assert isinstance(bench.asked(m.Register("cam", (), (new, more))), m.Registered)
+    assert bench.shard.state.catalogue.shown() == before
+    assert len(bench.log) == log
+    assert bench.counter("permission_denied") == 0
+    other = known._replace(reads=True, fingerprint="str")
+    assert bench.asked(m.Register("cam", (), (other,))).code == "datum_type"
+    assert refused(
+        bench.asked(m.Register("cam", (), (more._replace(reads=False),))), "write", "aspect count"
+    )
+    writer = GuardedBench(read="online:**", change="online:*/new")
+    assert isinstance(writer.asked(m.Register("cam", (), (new,))), m.Registered)
+    assert "new" in writer.shard.state.catalogue.aspects
 
 
 def test_a_pattern_half_inside_a_rule_is_refused():

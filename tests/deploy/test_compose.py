@@ -5,11 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from enact_dist.cli.main import build_parser
+from enact_dist.cli.main import build_parser, main
 from enact_dist.config.read import load_config
 
 ACTORS = Path(__file__).parents[2] / "actors"
-TEXT = (Path(__file__).parents[2] / "deploy" / "compose.yaml").read_text("utf-8")
+DEPLOY = Path(__file__).parents[2] / "deploy"
+TEXT = (DEPLOY / "compose.yaml").read_text("utf-8")
 
 
 @pytest.mark.parametrize("name", ["left", "right"])
@@ -45,3 +46,27 @@ def test_a_profile_of_the_compose_file_runs_every_process_of_its_cell_once(profi
         shared = any(one.process == name for one in cell.actors)
         assert words.startswith("--process") == shared, name
     assert sorted(shard.name for shard in cell.shards) == sorted(shards)
+
+
+def test_the_containers_with_keys_are_the_names_of_their_cell(tmp_path, monkeypatch):
+    """One key for each name, of the file that the container `keys` puts together; all rights given."""
+    for variable, value in re.findall(
+        r"^  (ENACT_SHARD\w+): (\S+)",
+        (DEPLOY / "compose.secure.yaml").read_text("utf-8"),
+        re.MULTILINE,
+    ):
+        monkeypatch.setenv(variable, value)
+    file = tmp_path / "cell.toml"
+    parts = (ACTORS / "palletizing" / "cell.toml", DEPLOY / "secure" / "cell.toml")
+    file.write_text("".join(part.read_text("utf-8") for part in parts), "utf-8")
+    folders = re.findall(
+        r"- keys-[\w-]+:/hosts/(\S+)", (DEPLOY / "compose.secure.yaml").read_text("utf-8")
+    )
+
+    written = main(["actor", "check", "--rights", "--cell", str(file)])
+    cell = load_config(file)
+
+    assert written == main(["actor", "check", "--cell", str(file)]) == 0
+    assert sorted(folders) == sorted(
+        (*cell.key_holders, *(f"shard.{shard.name}" for shard in cell.shards))
+    )

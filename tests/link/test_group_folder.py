@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from ports import free_endpoint
+from test_ownership import KNOWS_ALL_BUT_THE_SECRET
 from test_payload_desk import FILE, SIZE, adopted, stage
 
 from enact_dist import Aspect, Durability, Entity, Lock, View, Write, connect
@@ -246,15 +247,41 @@ def test_users_of_a_cell_with_rights_get_copies(tmp_path, monkeypatch):
         shutil.rmtree(root)
 
 
-@as_root
-@pytest.mark.carrier("socket")
-def test_large_data_of_other_users_travel_over_the_socket(folder, daemon, endpoint, shared_root):
-    """They get copies, and no file: a reader and a writer of two further users."""
+@pytest.fixture
+def group_root(shared_root):
+    """The root of shared folders, which the group of two further users may enter."""
     os.chown(shared_root, 0, STRANGER)
     shared_root.chmod(0o3770)
-    for above in (shared_root, *shared_root.parents):
-        if above.stat().st_uid == 0 and not above.stat().st_mode & 0o001 and above != shared_root:
+    for above in shared_root.parents:
+        if above.stat().st_uid == 0 and not above.stat().st_mode & 0o001:
             pytest.skip(f"other users may not enter {above}")
+    return shared_root
+
+
+@as_root
+@pytest.mark.carrier("socket")
+@pytest.mark.usefixtures("folder", "group_root")
+def test_user_of_the_group_neither_ends_nor_bars_a_session(daemon, endpoint):
+    """It may connect, and knows the id and the name of each session: from listings."""
+    shard = daemon(endpoint)
+    with connect(endpoint, actor="victim") as cell:
+        count = Write(cell.world("online"), Entity("cup"), Aspect("count", int))
+        with Lock(count) as lock:
+            session = cell.actors()[0].session
+            words = (shard._shared.path / "socket", session, shard.host.owner_of(session))
+            told = run_as(STRANGER - 1, STRANGER, KNOWS_ALL_BUT_THE_SECRET, *words)
+            lock[count] = 1
+        assert cell._client.carrier.transport_of("s0") == "socket"
+    said = f"of user {STRANGER - 1} does not know the secret of session {session[:8]}"
+    assert [said in line for line in told] == [True, True]
+    assert shard.host.figures().get("sessions_died", 0) == 0
+
+
+@as_root
+@pytest.mark.carrier("socket")
+@pytest.mark.usefixtures("folder", "group_root")
+def test_large_data_of_other_users_travel_over_the_socket(daemon, endpoint):
+    """They get copies, and no file: a reader and a writer of two further users."""
     shard = daemon(endpoint)
     cloud = Aspect("cloud", np.ndarray, Durability.VOLATILE)
     with connect(endpoint) as cell:

@@ -9,7 +9,7 @@ from enact_dist.link import lease as lease_module
 from enact_dist.link.clock import SystemClock
 from enact_dist.link.daemon.embedded import EmbeddedCarrier
 from enact_dist.link.host import ShardHost
-from enact_dist.link.lease import Lease, ShardTakenError
+from enact_dist.link.lease import HostLease, ShardTakenError
 
 
 class Holding:
@@ -17,7 +17,7 @@ class Holding:
 
     def __init__(self):
         self.now_s = 100.0
-        self.lease = Lease(2.0, lambda: self.now_s)
+        self.lease = HostLease(2.0, lambda: self.now_s)
         self.lease.confirmed(self.now_s)
         self.holding = self
         self.failed = None
@@ -66,7 +66,7 @@ def peer_of(host, make_peer):
 def test_a_lease_counts_from_when_a_write_was_sent():
     """Less the drift of two clocks; a late confirmation of an earlier write takes nothing back."""
     now_s = 10.0
-    lease = Lease(2.0, lambda: now_s)
+    lease = HostLease(2.0, lambda: now_s)
     assert not lease.holds
     sent_s = lease.now_s()
     now_s = 11.5
@@ -77,7 +77,7 @@ def test_a_lease_counts_from_when_a_write_was_sent():
     assert not lease.holds
     lease.confirmed(11.9)
     lease.confirmed(10.5)
-    assert lease.held_until_s == pytest.approx(11.9 + 1.96)
+    assert lease.lease.until_ns / 1e9 == pytest.approx(11.9 + 1.96)
 
 
 def test_nothing_leaves_a_shard_whose_lease_has_ended(host, holding, make_peer):

@@ -1,20 +1,27 @@
 """Over either carrier: nobody speaks for another's session, and each message comes on its own key."""
 
+import os
 import re
+import secrets
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import zenoh
 
+from enact_dist import Aspect, Durability, Entity, Lock, Write, connect
 from enact_dist.core.protocol import messages as m
 from enact_dist.core.protocol.datum import Datum, LockId, Position, Slot
 from enact_dist.core.shard import on_view, owners
 from enact_dist.core.state import sessions
 from enact_dist.errors import PermissionDeniedError, ProtocolError
 from enact_dist.link.memory import payload_desk
+from enact_dist.link.memory.names import SERIES_MAX
 from enact_dist.link.refusals import error_of
 from enact_dist.link.socket import service as socket_service
+from enact_dist.link.socket.carrier import SocketCarrier
 from enact_dist.link.socket.frames import FrameKind, Stream, greeting_of, send_frame
+from enact_dist.link.zenoh.access import session_of
 from enact_dist.link.zenoh.config import MESSAGE_BYTES_MAX, close_session, open_session
 from enact_dist.link.zenoh.queries import wait_connected
 from enact_dist.wire.frames import decode_frame, encode_frame
@@ -22,6 +29,7 @@ from enact_dist.wire.keys import request_key, verb_of
 from enact_dist.wire.limits import COMMIT_BYTES_MAX, FRAME_BYTES_MAX
 
 PAGE = Path(__file__).parents[2] / "enact_dist" / "docs" / "security.md"
+NOTHING, VOLATILE = Datum(b"", b"", 0), Durability.VOLATILE
 both = pytest.mark.parametrize("carry", ["zenoh", "socket"], indirect=True)
 
 
@@ -203,6 +211,79 @@ def test_process_that_greets_for_a_session_of_zenoh_does_not_end_it_with_its_own
     assert isinstance(victim.commit(granted, "cup", b"1"), m.Committed)
 
 
+KNOWS_ALL_BUT_THE_SECRET = """
+import socket, sys
+from enact_dist.link.socket.frames import FrameKind, Stream, greeting_of, send_frame
+for secret in ("", "0" * 32):
+    near = socket.socket(socket.AF_UNIX)
+    near.connect(sys.argv[1])
+    send_frame(near, greeting_of(sys.argv[2], sys.argv[3], secret), kind=FrameKind.OPEN)
+    kind, text, _ = Stream(near).receive()
+    print(int(kind), text.decode(), flush=True)
+"""
+
+
+def refused_eve(program, shard, session, identity):
+    """Whether a process that knows all that listings show is refused, by name; it has ended."""
+    eve = program(KNOWS_ALL_BUT_THE_SECRET, shard._shared.path / "socket", session, identity)
+    lines = eve.communicate(timeout=30)[0].splitlines()
+    said = f"process {eve.pid} of user {os.geteuid()} does not know the secret of session"
+    return [line.startswith(f"{int(FrameKind.REFUSED)} {said}") for line in lines] == [True, True]
+
+
+@pytest.mark.carrier("socket")
+def test_process_that_comes_before_the_owner_neither_ends_nor_bars_its_session(
+    daemon, carry, make_peer, endpoint, program
+):
+    """With its id and its name, where the shard has not met it yet."""
+    shard, secret = daemon(endpoint), secrets.token_hex(16)
+    session = session_of("tester", secret)
+
+    assert refused_eve(program, shard, session, "tester")
+    behind = carry(endpoint, session=session)
+    victim = peer_over(SocketCarrier(behind, session, "tester", secret, forced=True), make_peer)
+    granted = victim.acquire("cup")
+    assert refused_eve(program, shard, session, "tester")
+
+    assert isinstance(victim.commit(granted, "cup", b"1"), m.Committed)
+    assert "sessions_died" not in shard.host.figures()
+
+
+@pytest.mark.carrier("socket")
+def test_process_neither_ends_nor_bars_a_session_that_has_no_socket_open(
+    daemon, endpoint, program, monkeypatch
+):
+    """A client of the library over Zenoh; then one over the socket, in the same way."""
+    shard = daemon(endpoint)
+    for way in ("zenoh", "socket"):
+        monkeypatch.setenv("ENACT_CARRIER", way)
+        with connect(endpoint, actor="victim") as cell:
+            count = Write(cell.world("online"), Entity("cup"), Aspect("count", int, VOLATILE))
+            with Lock(count) as lock:
+                session = cell.actors()[0].session
+                assert refused_eve(program, shard, session, shard.host.owner_of(session))
+                lock[count] = 1
+    assert "sessions_died" not in shard.host.figures()
+
+
+@both
+def test_data_given_up_in_the_name_of_no_session_take_no_place(
+    daemon, carry, make_peer, endpoint, stranger
+):
+    """What a shard remembers of late slices stays that of its clients."""
+    shard = daemon(endpoint)
+    victim = peer_over(carry(endpoint), make_peer)
+    given_up = m.Stage(victim.session, f"{victim.session}-1", 0, 0, NOTHING)
+    assert isinstance(victim.call("s0", given_up), m.Staged)
+    for number in range(SERIES_MAX + 1):
+        file = f"ghost{number}-1"
+        assert stranger(m.Stage(f"ghost{number}", file, 0, 0, NOTHING), "eve@h:1").file == file
+    late = replace(given_up, total=100_000)
+
+    assert victim.call("s0", late).have == 100_000  # a late copy that no client waits for
+    assert shard.host.figures()["payload_drafts"] == 0
+
+
 RELEASES_ANOTHERS = """
 import socket, sys
 from enact_dist.core.protocol.datum import LockId
@@ -221,7 +302,7 @@ print(decode_frame(header, payload).code, flush=True)
 
 
 @pytest.mark.carrier("socket")
-@pytest.mark.parametrize("carry", ["socket"], indirect=True)
+@both
 def test_process_that_takes_anothers_name_releases_none_of_its_locks(
     daemon, carry, make_peer, endpoint, program
 ):

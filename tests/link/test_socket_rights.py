@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import os
 import threading
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
 import pytest
 from ports import free_endpoint
 
-from enact_dist import Aspect, Durability, Entities, Entity, Lock, View, Write, connect
+from enact_dist import Aspect, Durability, Entities, Entity, Lock, View, ViewEach, Write, connect
 from enact_dist.config.read import load_config
+from enact_dist.core.protocol import messages as m
+from enact_dist.core.protocol.datum import LockId
 from enact_dist.core.rights.rules import Rights
 from enact_dist.errors import LinkError, PermissionDeniedError
 from enact_dist.link.daemon.daemon import start_shard
 from enact_dist.link.daemon.settings import DaemonSettings
 from enact_dist.link.socket import service
 from enact_dist.link.socket.peers import PeerCredentials, peer_of
+from enact_dist.verify.floods.raw import RawZenoh
+from enact_dist.wire.limits import INTEGER_MAX
 
 pytestmark = pytest.mark.carrier("auto")
 
@@ -45,20 +49,18 @@ read = "online:**"
 
 
 @contextmanager
-def guarded(tmp_path):
-    """Yield a running shard with rights, and its cell.toml."""
+def guarded(tmp_path, *others):
+    """Yield a running shard with rights, beside it other ones, and their cell.toml."""
     file = tmp_path / "cell.toml"
-    file.write_text(CELL.format(endpoint=free_endpoint()), "utf-8")
+    more = (f'[shards.{name}]\nlisten = "{free_endpoint()}"\n' for name in others)
+    file.write_text(CELL.format(endpoint=free_endpoint()) + "".join(more), "utf-8")
     config = load_config(file, environment={})
-    shard = start_shard(
-        DaemonSettings(
-            config.name, config.shard_settings("s"), config.shard("s").listen, carrier="socket"
-        )
-    )
-    try:
+    with ExitStack() as stack:
+        for one in reversed(config.shards):
+            settings = config.name, config.shard_settings(one.name), one.listen
+            shard = start_shard(DaemonSettings(*settings, carrier="socket"))
+            stack.callback(shard.stop, drain_s=0.0)
         yield shard, file
-    finally:
-        shard.stop(drain_s=0.0)
 
 
 def put(cell, entity, value):
@@ -92,6 +94,19 @@ def test_names_of_one_user_have_their_rights_over_the_socket(tmp_path):
         assert shard.host.figures()["permission_denied"] >= 3
 
 
+def test_a_reader_sees_data_whose_aspect_one_shard_does_not_know(tmp_path):
+    """A pattern lies on all shards, and what it has to register there needs no right to write."""
+    with (
+        guarded(tmp_path, "t", "u") as (_, file),
+        connect(file, actor="camera") as camera,
+        connect(file, actor="logger") as logger,
+    ):
+        put(camera, "view/1", 1)
+        seen = ViewEach(logger.world("online"), Entities("view/*"), COUNT)
+        with Lock(seen) as lock:
+            assert list(lock[seen].values()) == [1]
+
+
 def test_a_name_over_zenoh_is_no_proof(tmp_path, monkeypatch):
     """It is refused by an error after which an actor tries again."""
     with guarded(tmp_path) as (_, file):
@@ -103,6 +118,25 @@ def test_a_name_over_zenoh_is_no_proof(tmp_path, monkeypatch):
             pytest.raises(LinkError, match="over Zenoh, where its name is only its own word"),
         ):
             put(ada, "view/1", 1)
+
+
+def test_a_name_over_zenoh_ends_nothing_of_that_name(tmp_path):
+    """Whoever takes the name of a client, and the id of its session, from a listing."""
+    with guarded(tmp_path) as (shard, file), connect(file, actor="camera") as camera:
+        request = Write(camera.world("online"), Entity("view/1"), COUNT)
+        with RawZenoh(load_config(file, environment={})) as raw, Lock(request) as lock:
+            (session,), (identity,) = zip(*shard.host.owners().items(), strict=True)
+            epoch, held = shard.host.epoch, LockId(session, 0, 1)
+            views = tuple(m.LaneView(lane, INTEGER_MAX) for lane in range(4))
+            for message in (m.Release(held), m.Goodbye(session)):
+                answer = raw.ask("s", message, actor=identity)
+                assert answer.code == "unproven"
+                assert "asked to end sessions and locks over Zenoh" in answer.text
+            renewed = raw.ask("s", m.KeepAlive(session, epoch, 1, views, b""), actor=identity)
+            assert isinstance(renewed, m.Alive)
+            assert [one.lock.session for one in renewed.grants] == [session]
+            lock[request] = 1
+        assert shard.host.figures().get("orphans_freed", 0) == 0
 
 
 def test_a_watch_over_the_socket_leaves_out_what_is_not_readable(tmp_path):
@@ -156,6 +190,7 @@ def test_a_reload_changes_whose_rights_a_connection_uses(tmp_path, monkeypatch):
         assert subjects == {"@cams"}
         take(None)
         assert present.ended.wait(5.0)
+        assert shard.host.figures()["sessions_barred"] == 1
         with pytest.raises(LinkError, match="has no rights at shard s"):
             connect(file, actor="camera", timeout_s=0.2)
 

@@ -166,8 +166,8 @@ def test_place_of_a_client_that_left_before_its_greeting_was_answered_is_free(
     nears = [raw("hasty", greet=False) for _ in range(3)]
     left, gone = [], threading.Event()
 
-    def admit_late(served, connection, session):
-        admit(served, connection, session)
+    def admit_late(served, connection, session, secret):
+        admit(served, connection, session, secret)
         left.append(session)
         assert gone.wait(30)
 

@@ -28,7 +28,7 @@ import sys
 from pathlib import Path
 from enact_dist.core.protocol.messages import PlacementMap, ShardEntry
 from enact_dist.core.shard.state import ShardSettings
-from enact_dist.link.daemon.daemon import run_shard
+from enact_dist.link.daemon.process import run_shard
 from enact_dist.link.daemon.settings import DaemonSettings
 endpoint, folder = sys.argv[1:]
 shard = ShardSettings(

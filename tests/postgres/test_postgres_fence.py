@@ -11,9 +11,10 @@ from postgres_nodes import await_sync
 from shard_stores import address_of, state, take, versions
 from tcp_proxy import TcpProxy
 
+from enact_dist.core.failover.lease import HolderRow
 from enact_dist.errors import StoreError
 from enact_dist.link.lease import ShardTakenError
-from enact_dist.link.postgres.address import FreeShard, SeenRow, ShardHeldError
+from enact_dist.link.postgres.address import FreeShard, ShardHeldError
 from enact_dist.link.postgres.opening import open_database
 from enact_dist.link.postgres.standby import wait_free
 from enact_dist.terms import Durability
@@ -71,7 +72,7 @@ def test_an_old_daemon_writes_nothing(server, stores):
         epoch, _, holder = row_of(server, address)
         beat = server.execute("SELECT beat FROM enact.shard WHERE epoch = %s", (epoch,))[0][0]
         medium._renewer.close()
-        free = FreeShard(address, SeenRow(epoch, beat, holder))
+        free = FreeShard(address, HolderRow(epoch, 0, beat, holder))
         new, recovered = open_database(free, unix_s=1)
         with closing(new):
             with pytest.raises(ShardTakenError, match=address.shard):
@@ -155,7 +156,7 @@ def test_a_shard_without_a_sign_is_free_after_the_lease(server, stores):
     old, _, medium = stores.open(address)
     old.write([state(1)])
     medium._renewer.close()
-    sent_s = medium.lease.held_until_s - medium.lease.usable_s
+    sent_s = medium.lease.lease.until_ns / 1e9 - medium.lease.usable_s
 
     _, recovered, _ = stores.open(address, patient=True)
 

@@ -4,7 +4,7 @@ from unittest.mock import MagicMock
 
 import numpy as np
 
-from enact_dist.view.drawing.nodes import AxesNode, LabelNode
+from enact_dist.view.drawing.nodes import AxesNode, LabelNode, PointsNode
 from enact_dist.view.drawing.scene import SceneView
 from enact_dist.view.pages.canvas import Canvas
 
@@ -41,3 +41,17 @@ def test_frames_of_entities_that_have_gone_are_removed():
     assert len(canvas._frames) == len(canvas._drawn) == 1
     assert len(canvas._numbers) == 2
     assert len(set(paths)) == len(paths) == 100
+
+
+def test_points_of_one_colour_are_moved_and_others_sent_again():
+    client = MagicMock()
+    canvas, cloud = Canvas(client), client.scene.add_point_cloud
+    red, blue, each = (200, 0, 0), (0, 0, 200), np.zeros((7, 3), np.uint8)
+    added = []
+    for count, colours, size_m in ((5, red, 0.1), (6, red, 0.1), (6, blue, 0.1), (6, blue, 0.2),
+                                   (7, each, 0.2), (7, each.copy(), 0.2)):  # fmt: skip
+        points_m = np.full((count, 3), count, np.float32)
+        assert canvas.draw({"": scene(PointsNode("cell", points_m, colours, size_m))}) == 1
+        added.append(cloud.call_count)
+    assert added == [1, 1, 2, 3, 4, 5]
+    assert cloud.return_value.points.shape == (6, 3)

@@ -9,6 +9,7 @@ from view_samples import SHOWS, move, moved, shown, slot, until
 
 from enact_dist.cli.main import main
 from enact_dist.errors import ConfigError
+from enact_dist.view.pages import page as pages
 from enact_dist.view.pages.page import Page
 from enact_dist.view.pages.server import free_port
 from enact_dist.view.pages.viewer import Viewer, ViewSettings
@@ -45,16 +46,31 @@ def test_a_page_outlives_what_its_tick_and_its_events_raise(page, monkeypatch):
     assert page._thread.is_alive()
 
 
-def test_events_are_taken_at_once_and_ticks_in_their_time(page, monkeypatch):
-    """However much a person does, the rate bounds what is drawn."""
-    ticks, taken = [], []
+def test_a_click_is_shown_at_once_and_a_drag_in_its_time(page, monkeypatch):
+    """However much a person does, the rate bounds what is drawn; the next is due in 0.5 s."""
+    ticks, taken, waited_s = [], [], []
     monkeypatch.setattr(page, "_tick", lambda: ticks.append(1))
     monkeypatch.setattr(page, "_on_fit", taken.append)
+    page._viewer.rate_hz, page._acted_s = 0.1, time.monotonic() - 20.0
     for number in range(3):
         page._send("fit", number)
-        page._take_events(time.monotonic() + 0.01)
+        begun_s = time.monotonic()
+        page._take_events(begun_s, begun_s + 0.5)
+        waited_s.append(time.monotonic() - begun_s)
         assert taken == list(range(number + 1))
+    assert waited_s[0] < 0.5 <= min(waited_s[1:])
     assert ticks == []
+
+
+def test_rows_are_shown_again_as_soon_as_their_values_come(page, monkeypatch):
+    """They do not wait for the next listing."""
+    page._filter = "nothing"
+    page.start()
+    until(lambda: len(page._viewer.feed.catalogue.slots("online")) == 2 and page._listed_s)
+    monkeypatch.setattr(pages, "LISTED_S", 30.0)
+    page._send("filter", "speed")
+    handles = page._client.gui.handles
+    until(lambda: any("<b>arm/speed</b> 0.5" in str(h.content) for h in [*handles.values()]))
 
 
 def test_the_slider_reaches_from_the_oldest_moment_to_the_present(page, cell):

@@ -5,12 +5,7 @@ import pytest
 pytest.importorskip("cryptography", reason="making keys needs the extra 'keys'")
 pytest.importorskip("viser", reason="pages need the extra 'view'")
 
-import sys
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "link"))
-
-import key_cells
+from rights_cells import guarded_cell
 from view_samples import until
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
@@ -20,23 +15,14 @@ from enact_dist.core.protocol.datum import Slot
 from enact_dist.view.feed import Feed
 from enact_dist.view.source import CellSource
 
-pytestmark = pytest.mark.carrier("zenoh")
+pytestmark = pytest.mark.carrier("auto")
 
-RIGHTS = """
-[rights]
-default = "none"
-programs = ["reader", "blind"]
-observe = ["reader"]
-[[rights.allow]]
-who = "reader"
-read = "online:open/**"
-"""
 SLOTS = [Slot("online", name, "count") for name in ("open/x", "secret/x", "secret/y")]
 
 
 @pytest.fixture
-def file(tmp_path):
-    cell = key_cells.KeyCell(tmp_path, more=RIGHTS)
+def file(tmp_path, request):
+    cell = guarded_cell(tmp_path, carrier=getattr(request, "param", "zenoh"))
     with cell.running():
         yield cell.file
 
@@ -68,6 +54,20 @@ def test_what_is_not_readable_is_named_beside_the_rest(file, monkeypatch):
             found = source.data_at(SLOTS, feed.catalogue.newest_ns)
             assert set(found.data) == {SLOTS[0]}
             assert sorted(slot for slot, _ in found.denied) == SLOTS[1:]
+
+
+@pytest.mark.parametrize("file", ["zenoh", "socket"], indirect=True)
+def test_history_of_what_is_not_readable_takes_no_other_with_it(file, monkeypatch):
+    """Neither one slot alone, which its shard refuses, nor one among several."""
+    with connect(file, actor="ada") as ada:
+        put(ada, 1)
+        monkeypatch.setenv("ENACT_IDENTITY", "reader")
+        with connect(file, actor="view", observer=True) as cell:
+            source = CellSource(cell)
+            alone = Slot("online", "secret/x", "unknown")
+            assert source.histories([SLOTS[1]]) == {}
+            assert source.histories([*SLOTS, alone]).keys() == {SLOTS[0]}
+            assert source.histories([SLOTS[0], alone]).keys() == {SLOTS[0]}
 
 
 def test_without_the_right_to_observe_it_ends(file, capsys, monkeypatch):

@@ -29,7 +29,7 @@ def run_shard(options: argparse.Namespace) -> int:
     """Run one shard daemon in this process."""
     from enact_dist.config.environment import variable_of
     from enact_dist.config.read import load_config
-    from enact_dist.link.daemon.daemon import run_shard as run_shard_daemon
+    from enact_dist.link.daemon.process import run_shard as run_shard_daemon
     from enact_dist.link.daemon.settings import DRAIN_S, DaemonSettings
     from enact_dist.link.zenoh.tls import shard_keys
 

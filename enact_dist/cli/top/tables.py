@@ -256,6 +256,10 @@ def _datum(row: DatumRates) -> str:
     return f"{row.world}:{row.entity}/{row.aspect}"
 
 
+def _storing(row: DatumRates) -> str:
+    return f"{row.shard}, AWAY" if row.away else row.shard
+
+
 _DATA: Final = TopTable(
     "d",
     "data",
@@ -267,7 +271,7 @@ _DATA: Final = TopTable(
         TopColumn("version", lambda row: f"v{row.version}", attrgetter("version")),
         TopColumn("age", lambda row: f"NULL ({row.null_reason})" if row.null_reason
                else shown_s(row.age_s), attrgetter("age_s"), falls=False),
-        _name("shard", "shard"),
+        TopColumn("shard", _storing, _storing, falls=False),
     ),
     lambda rates: rates.data,
     1,

@@ -370,6 +370,10 @@ class Refused:
     text: str
 
 
+PERMISSION = "permission"
+"""The code of a refusal because of the sender, or for want of a right."""
+
+
 @message
 class Versions:
     """Versions of slots: slot by slot, oldest first."""

@@ -28,6 +28,7 @@ from enact_dist.core.protocol.answers import (
     OUTCOME_EXPIRED,
     OUTCOME_PENDING,
     OUTCOME_UNSEEN,
+    PERMISSION,
     RESOLVED_ABORTED,
     RESOLVED_COMMITTED,
     RESOLVED_OPEN,

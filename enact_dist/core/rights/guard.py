@@ -7,7 +7,8 @@ request                                  right
 `Fetch`                                  none for what a lock of the session pins, else `read`
 `Commit`, `Prepare`                      of each slot `change`, `init` or `delete`, by what is there
 `Stage`                                  any of these on anything
-`Register`                               `write` somewhere of each aspect; `register` of new worlds
+`Register`                               `write` somewhere of each aspect, unless it only reads it;
+                                         `register` of new worlds
 `Fork`, `DropWorld`, `KeepVersions`      `fork` and `read` of the whole source; `drop`; `keep`
 `Break`; `ForceAbort`, settled alarms    `break`; `resolve`
 `Survey`, `ListHistory`                  none; what is not readable is left out
@@ -16,10 +17,13 @@ request                                  right
 `ListAudit`, `ListRefusals`
 =======================================  =======================================================
 
+A reader registers what it reads, too, so that every shard of a cell has the same type of it.  From
+one that may not write the aspect, a shard takes neither a new aspect nor more retention.
 A question about one slot alone is refused without `read` of it: it would look like null otherwise.
-Everything else needs none: the owner of a session may renew, release and end, and shards are known
-by their own identity (`enact_dist.core.shard.owners`).  Locks are refused before they get a place
-in the queue.  A commit is compared again behind its fence, since a client may send anything.
+Everything else needs none: the owner of a session may renew it, and release and end if the
+transport vouches for its name; shards are known by their own identity
+(`enact_dist.core.shard.owners`).  Locks are refused before they get a place in the queue.  A commit
+is compared again behind its fence, since a client may send anything.
 """
 
 from __future__ import annotations
@@ -28,6 +32,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 from enact_dist.core.protocol.datum import Slot
 from enact_dist.core.protocol.messages import (
+    PERMISSION,
     Acquire,
     Break,
     Commit,
@@ -36,6 +41,7 @@ from enact_dist.core.protocol.messages import (
     FindEffects,
     ForceAbort,
     Fork,
+    Goodbye,
     KeepVersions,
     ListAudit,
     ListHistory,
@@ -45,11 +51,12 @@ from enact_dist.core.protocol.messages import (
     RefusalEntry,
     Refused,
     Register,
+    Release,
     Stage,
     TakeView,
 )
 from enact_dist.core.protocol.records import Story
-from enact_dist.core.rights.rules import ALL, DENIED, UNPROVEN, WRITE, path_of
+from enact_dist.core.rights.rules import ALL, UNPROVEN, WRITE, path_of
 from enact_dist.terms import ACCESSES
 
 if TYPE_CHECKING:
@@ -68,6 +75,7 @@ NOTED_MAX: Final = 1_000
 _OBSERVING: Final = frozenset(
     (ListLocks, ListSessions, Explain, FindEffects, ListAudit, ListRefusals)
 )
+_ENDING: Final = frozenset((Goodbye, Release))
 
 
 class SlotContents(Protocol):
@@ -131,6 +139,8 @@ class Guard:
             return self.denied(WRITE, "anything")
         if kind in _OBSERVING and (refused := self._plain("observe", ALL, "the cell")) is not None:
             return refused
+        if kind in _ENDING and self.subject == UNPROVEN:
+            return self.denied("end", "sessions and locks")
         alone = _asked_alone(message)
         return self.may_not_read(alone) if alone is not None else None
 
@@ -150,12 +160,16 @@ class Guard:
 
     def _register(self, message: Register, worlds: Collection[str]) -> Refused | None:
         for entry in message.aspects:
-            if not self.rights.may_write_some(self.subject, f"*/{entry.name}/{ALL}"):
+            if not entry.reads and not self.may_alter(entry.name):
                 return self.denied(WRITE, f"aspect {entry.name}")
         for world in message.worlds:
             if world not in worlds and not self.rights.may(self.subject, "register", world):
                 return self.denied("register", world)
         return None
+
+    def may_alter(self, aspect: str) -> bool:
+        """Whether the present subject may register an aspect, or change how it is registered."""
+        return self.rights.may_write_some(self.subject, f"*/{aspect}/{ALL}")
 
     def _fork(self, message: Fork) -> Refused | None:
         source, world = message.source, message.world
@@ -210,7 +224,7 @@ class Guard:
                 self._told.clear()
             self._told[key] = now_ns, 0
             more = f"; {left_out} more since the last line" if left_out else ""
-            asker = f" (asked by {self.asker})" if refused.code == DENIED and self.asker else ""
+            asker = f" (asked by {self.asker})" if refused.code == PERMISSION and self.asker else ""
             yield Story("permission.denied", f"{refused.text}{asker}{more}")
         self.denials.clear()
 

@@ -36,7 +36,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.protocol.messages import Refused
+from enact_dist.core.protocol.messages import PERMISSION, Refused
 from enact_dist.patterns import contained, container, pattern_matches, patterns_overlap
 
 if TYPE_CHECKING:
@@ -60,8 +60,6 @@ UNPROVEN: Final = "-"
 """The subject of a client that only says its own name; no name starts with a hyphen."""
 NOT_PROVEN: Final = "unproven"
 """The code of a refusal to a client without a proven name."""
-DENIED: Final = "permission"
-"""The code of a refusal to one that has not the right."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,7 +238,7 @@ class Rights:
             )
         does = "declares no such request" if right in (*DATA_RIGHTS, WRITE) else "has no such right"
         return Refused(
-            DENIED,
+            PERMISSION,
             f"{subject} may not {right}{on}: it {does} and no [[rights.allow]] gives it; `enact"
             f" actor check --rights`, or add it ({self.hint})",
         )

@@ -35,6 +35,7 @@ from enact_dist.core.protocol.records import (
     Story,
     WorldRecord,
 )
+from enact_dist.core.rights.rules import UNPROVEN
 from enact_dist.core.shard import owners
 from enact_dist.core.shard.inspection import REPORT_BYTES_MAX
 from enact_dist.terms import Durability
@@ -152,7 +153,7 @@ class SessionDesk:
 
     def on_register(self, message: Register, reply_to: int) -> Iterator[Effect]:
         """Create world contexts and register aspects, all or none."""
-        catalogue = self._state.catalogue
+        catalogue, guard = self._state.catalogue, self._state.guard
         if self._state.sessions.known(message.session) is None:
             yield Reply(reply_to, EpochChanged(self._state.epoch))
             return
@@ -167,7 +168,8 @@ class SessionDesk:
         records: list[Record] = [WorldRecord(name) for name in missing]
         for entry in message.aspects:
             wrong = wrong_aspect(entry)
-            registered = catalogue.register(entry) if wrong is None else wrong
+            alters = guard is None or not entry.reads or guard.may_alter(entry.name)
+            registered = catalogue.register(entry, alters=alters) if wrong is None else wrong
             if isinstance(registered, str):
                 registered = Refused("datum_type", registered)
             if isinstance(registered, Refused):
@@ -209,7 +211,9 @@ class SessionDesk:
         session.renew(self._state.now_ns, message.count)
         if message.report:  # kept for listings, which leave longer ones out
             session.report = message.report if len(message.report) <= REPORT_BYTES_MAX else b""
-        lowest = {view.lane: view.seq for view in message.view}
+        guard = self._state.guard
+        proven = guard is None or guard.subject != UNPROVEN  # what ends locks has to be
+        lowest = {view.lane: view.seq for view in message.view if proven}
         for tenure in self._state.tenures.of_session(message.session):
             unwanted = tenure.lock.seq < lowest.get(tenure.lock.lane, 0)
             if unwanted and not (tenure.bound or tenure.kept):

@@ -48,6 +48,7 @@ from enact_dist.core.protocol.records import (
     Record,
     Reply,
     SlotRecord,
+    Story,
     WorldDropped,
     WorldRecord,
 )
@@ -238,6 +239,8 @@ class WorldDesk:
         state, world = self._state, message.world
         state.catalogue.drop_world(world)
         state.busy_worlds[world] = "being dropped"
+        if state.asker:
+            yield Story("world.dropped", f"{state.asker} drops world context {world!r}")
         dropped = WorldDropped(world, state.slots.version_base(world))
         yield from self._persist(act, (dropped, *self._labels_without(world)))
 

@@ -30,6 +30,7 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Final, get_args
 
 from enact_dist.core.protocol.messages import (
+    PERMISSION,
     Break,
     DropWorld,
     EpochChanged,
@@ -53,8 +54,6 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.records import Effect, Event
     from enact_dist.core.state.sessions import SessionTable
 
-PERMISSION: Final = "permission"
-"""The code of a refusal because of the sender."""
 SESSIONS_MAX: Final = 256
 """Sessions of one identity: a process needs one for each cell that it has open."""
 WAITERS_MAX: Final = 2_048

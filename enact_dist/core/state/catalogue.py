@@ -107,10 +107,17 @@ class Catalogue:
         entry = entry._replace(durability=durability)
         return with_larger(entry, configured) if configured else entry
 
-    def register(self, entry: AspectEntry) -> tuple[AspectEntry, bool] | str:
-        """Register an aspect; return its entry and whether it changed, or why it is refused."""
+    def register(
+        self, entry: AspectEntry, *, alters: bool = True
+    ) -> tuple[AspectEntry, bool] | str:
+        """Register an aspect; return its entry and whether it changed, or why it is refused.
+
+        Without `alters` it is only compared with what is registered.
+        """
         wanted = self._with_configured(entry)
         known = self.aspects.get(entry.name)
+        if known is None and not alters:
+            return wanted, False
         if known is None:
             wanted = wanted._replace(older=(), reads=False)
             self._set(wanted)
@@ -126,7 +133,7 @@ class Catalogue:
         now = with_type_of(known, wanted)
         if not covers(known, wanted):
             now = with_larger(now, wanted)
-        if now == known:
+        if now == known or not alters:
             return known, False
         self._set(now)
         return now, True
@@ -168,7 +175,9 @@ class Catalogue:
             if new > 0 and count > most:
                 return _too_much(f"{new} {what} to the {count - new} that are here; at most {most}")
         for name, known in before.items():
-            entry = self.aspects[name]
+            entry = self.aspects.get(name)
+            if entry is None:
+                continue
             length = len(entry.fingerprint)
             changed = known is None or known.fingerprint != entry.fingerprint
             if changed and length > FINGERPRINT_CHARACTERS_MAX:

@@ -38,6 +38,7 @@ def join(
     carrier: str = "auto",
     expected: Sequence[ShardEntry] = (),
     keys: KeyFiles | None = None,
+    secret: str = "",
 ) -> tuple[str, CellClient, Welcome]:
     """Return the cell's name, a client with an open carrier, and a shard's welcome.
 
@@ -50,6 +51,7 @@ def join(
         carrier: How messages travel, one of `CARRIERS`.
         expected: The shards and endpoints of `cell.toml`.
         keys: The files by which this process proves its name, in a cell with keys.
+        secret: Opens sockets for the session.
 
     Raises:
         LinkError: Another cell answers, or a socket is required and no shard has a usable one
@@ -79,7 +81,7 @@ def join(
     try:
         if carrier != "zenoh":
             way = sockets = SocketCarrier(
-                zenoh, client.session, identity, forced=carrier == "socket"
+                zenoh, client.session, identity, secret, forced=carrier == "socket"
             )
             welcome = _first_usable(sockets, client, welcome, timeout_s)
         way.add_endpoints(welcome.placement.shards)

@@ -1,20 +1,10 @@
-"""A shard as a process: folder, Zenoh session, signals, log.
-
-Exit status: 0 after SIGTERM or SIGINT; 1 if the shard cannot start or its store fails.  On a signal
-the daemon drains: it grants nothing new, answers parked requests, lets commits in progress end, and
-waits up to `drain_s` for holders to finish, which ends their leases.  A second signal cuts that
-wait short.  Locks still held then are logged and lost: their commits will be refused.  Everything
-else takes less than 1.2 s.
-"""
+"""A running shard: its folder or place in a database, its Zenoh session, its keys, its end."""
 
 from __future__ import annotations
 
-import gc
 import logging
 import os
 import secrets
-import signal
-import sys
 import threading
 import time
 from contextlib import ExitStack
@@ -23,23 +13,21 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.messages import ListLocks, Locks
 from enact_dist.core.protocol.records import Called, SessionBarred, SessionSeen, ShardReturned
-from enact_dist.errors import ConfigError, EnactError, LinkError, StoreError
+from enact_dist.errors import ConfigError, LinkError, StoreError
 from enact_dist.link.client.calls import Calls
 from enact_dist.link.client.duplicate_daemons import (
     Comparing,
 )
 from enact_dist.link.daemon.reload import Reload, checked_keys
 from enact_dist.link.daemon.second_daemon import refuse_second_daemon
-from enact_dist.link.daemon.service_manager import ServiceManager
 from enact_dist.link.daemon.settings import DRAIN_S, DaemonSettings
 from enact_dist.link.daemon.shard_calls import ShardCalls
 from enact_dist.link.daemon.successor import Successor
 from enact_dist.link.lease import ShardTakenError
-from enact_dist.link.log import READY, JsonLines, Log, TextLines, last_words, say
+from enact_dist.link.log import JsonLines, TextLines, last_words
 from enact_dist.link.memory.shared_folder import SharedFolder
 from enact_dist.link.opening import open_host
 from enact_dist.link.postgres.address import require_driver
-from enact_dist.link.signals import StopSignals
 from enact_dist.link.socket.service import SocketService
 from enact_dist.link.zenoh.config import close_session, listening_settings, open_session
 from enact_dist.link.zenoh.service import ZenohService
@@ -62,10 +50,6 @@ REOPEN_S, REOPEN_PAUSE_S = 5.0, 0.02
 """How long the port may take to be free for the shard's next Zenoh session."""
 TAKE_AGAIN_S: Final = 1.0
 """Pause of a standby after a takeover that failed."""
-SWITCH_INTERVAL_S: Final = 0.0002
-"""With Python's 5 ms a busy store thread would add 7 to 11 ms to a call (p90), measured."""
-GC_THRESHOLDS: Final = (5_000, 20, 1_000_000)
-"""Allocations between two collections of young objects, and how rarely older ones are examined."""
 
 _log = logging.getLogger("enact.shard")
 
@@ -75,6 +59,7 @@ class RunningShard:
 
     Args:
         settings: The settings of the shard.
+        certificate: Its certificate; None: it has no keys.
         free: The shard in a database that it takes over, in place of a folder.
         session: The Zenoh session that serves it, which clients know already; None: a new one.
         metrics: A server that shows this shard from now on; None: a new one, if one is wanted.
@@ -83,6 +68,7 @@ class RunningShard:
     def __init__(
         self,
         settings: DaemonSettings,
+        certificate: Certificate | None,
         free: FreeShard | None = None,
         session: zenoh.Session | None = None,
         metrics: MetricsServer | None = None,
@@ -111,16 +97,7 @@ class RunningShard:
             if self._shared is not None and settings.carrier != "zenoh":
                 self._sockets = SocketService(self.host, self._shared)
                 undo.callback(self._sockets.close)
-            self._metrics = metrics
-            if settings.metrics is not None:
-                from enact_dist.link.daemon.metrics import MetricsServer, source_of
-
-                source = source_of(self.host, settings.cell)
-                if metrics is not None:
-                    metrics.show(source)
-                else:
-                    self._metrics = MetricsServer(settings.metrics, source)
-                    undo.callback(self._metrics.close)
+            self._metrics = self._shown(metrics, undo)
             self._names = settings.common_names
             self._session = session or self._open_session()
             if session is None:
@@ -148,13 +125,26 @@ class RunningShard:
                 undo.callback(self._successor.close)
             self.reload: Reload | None = None
             if settings.keys is not None or settings.shard.rights is not None:
-                self.reload = Reload(self._take_again, self.host.count, settings.keys)
+                self.reload = Reload(self._take_again, self.host.count, settings.keys, certificate)
             undo.pop_all()
+
+    def _shown(self, metrics: MetricsServer | None, undo: ExitStack) -> MetricsServer | None:
+        if self.settings.metrics is None:
+            return None
+        from enact_dist.link.daemon.metrics import MetricsServer, source_of
+
+        source = source_of(self.host, self.settings.cell)
+        if metrics is None:
+            metrics = MetricsServer(self.settings.metrics, source)
+            undo.callback(metrics.close)
+        else:
+            metrics.show(source)
+        return metrics
 
     def _has_failed(self, failure: Exception) -> None:
         if isinstance(failure, ShardTakenError):
             # Another process serves the shard: whatever is still in this one must not leave it.
-            last_words(_formatter(self.settings), f"this process ends at once: {failure}")
+            last_words(formatter_of(self.settings), f"this process ends at once: {failure}")
             os._exit(1)
         self._ended.set()
 
@@ -340,16 +330,16 @@ def start_shard(settings: DaemonSettings) -> RunningShard:
         LinkError: An endpoint is in use, or another daemon already serves this shard.
         ConfigError: An endpoint cannot be read, or is missing, or the keys cannot be used.
     """
-    _check(settings)
-    return RunningShard(settings)
+    return RunningShard(settings, _check(settings))
 
 
-def _check(settings: DaemonSettings) -> None:
+def _check(settings: DaemonSettings) -> Certificate | None:
     if not settings.listen:
         raise ConfigError(f"shard {settings.shard.name} has no endpoint to listen at")
-    if settings.keys is not None:
-        checked_keys(settings.keys, settings.hosts)
+    keys = settings.keys
+    certificate = checked_keys(keys, settings.hosts) if keys is not None else None
     refuse_second_daemon(settings)
+    return certificate
 
 
 def take_shard(
@@ -372,7 +362,7 @@ def take_shard(
     from enact_dist.link.daemon.metrics import MetricsServer, StandbyProbes
     from enact_dist.link.postgres.standby import wait_free
 
-    _check(settings)
+    certificate = _check(settings)
     name, patient = settings.shard.name, settings.standby
     probes = StandbyProbes(settings)
 
@@ -396,7 +386,7 @@ def take_shard(
         ):
             probes.takes()
             try:
-                shard = RunningShard(settings, free, session, metrics)
+                shard = RunningShard(settings, certificate, free, session, metrics)
             except StoreError as error:
                 if not patient:
                     raise
@@ -408,91 +398,8 @@ def take_shard(
     return None
 
 
-def run_shard(settings: DaemonSettings) -> int:
-    """Run a shard until SIGTERM or SIGINT; return the exit status.  Main thread only."""
-    name = settings.shard.name
-    manager = ServiceManager()
-    formatter = _formatter(settings)
-    with Log(formatter), StopSignals() as signals:
-        try:
-            shard = _started(settings, signals.event, manager, formatter)
-        except EnactError as error:
-            if settings.log == "json":
-                _log.critical("shard %s: %s", name, error, extra={"event": "shard.refused"})
-            else:
-                print(f"shard {name}: {error}", file=sys.stderr, flush=True)
-            return 1
-        if shard is None:
-            return 0
-        try:
-            signals.call(lambda word: _stop(shard, word, manager))
-            signals.call_again(lambda _: shard.stop_now())
-            if shard.reload is not None:
-                signals.call_at(signal.SIGHUP, shard.reload)
-            shard.host.each_tick(lambda: manager.alive(shard.host.state))
-            _say_ready(shard, formatter)
-            manager.ready(shard.host.state)
-            _stay_responsive()
-            shard.wait()
-        finally:
-            shard.stop(drain_s=settings.drain_s)
-        return 1 if shard.failure is not None else 0
-
-
-def _started(
-    settings: DaemonSettings,
-    stopped: threading.Event,
-    manager: ServiceManager,
-    formatter: logging.Formatter,
-) -> RunningShard | None:
-    if settings.store is None:
-        return start_shard(settings)
-    if not settings.standby:
-        return take_shard(settings, stopped, lambda: None)
-    text = f"standing by for shard {settings.shard.name} of cell {settings.cell}"
-    told = threading.Event()
-
-    def waiting() -> None:
-        if not told.is_set():
-            told.set()
-            say(formatter, "shard.standby", text, endpoints=settings.listen)
-            manager.ready(text)
-        manager.alive(text)
-
-    return take_shard(settings, stopped, waiting)
-
-
-def _formatter(settings: DaemonSettings) -> logging.Formatter:
+def formatter_of(settings: DaemonSettings) -> logging.Formatter:
+    """Return how the log of a shard's process is written."""
     if settings.log == "json":
         return JsonLines(cell=settings.cell, process=f"shard {settings.shard.name}")
     return TextLines()
-
-
-def _stop(shard: RunningShard, name: str, manager: ServiceManager) -> None:
-    _log.info("%s received", name, extra={"event": "shard.stop"})
-    manager.stopping()
-    shard.end()
-
-
-def _say_ready(shard: RunningShard, formatter: logging.Formatter) -> None:
-    settings, epoch = shard.settings, shard.host.epoch
-    place = settings.store or settings.folder
-    folder = str(place) if place else None
-    data = f"data in {folder}" if folder else "data in memory only"
-    text = (
-        f"{READY} shard {settings.shard.name} of cell {settings.cell} at"
-        f" {', '.join(settings.listen)}, epoch {epoch}, {data}"
-    )
-    say(formatter, "shard.ready", text, endpoints=settings.listen, epoch=epoch, folder=folder)
-
-
-def _stay_responsive() -> None:
-    """Configure the interpreter for short calls beside computing threads and many slots.
-
-    A full collection over a million objects blocks all answers for 0.1 s or more.  The shard makes
-    no cycles (measured: none in 5,000 updates), so only young objects are collected.
-    """
-    sys.setswitchinterval(SWITCH_INTERVAL_S)
-    gc.collect()
-    gc.freeze()
-    gc.set_threshold(*GC_THRESHOLDS)

@@ -63,6 +63,7 @@ class Reload:
             raises `EnactError` and keeps the old ones if they cannot be used.
         count: Adds to a counter of the shard.
         keys: The shard's files, in a cell with keys.
+        certificate: The one with which the shard serves now.
     """
 
     def __init__(
@@ -70,9 +71,10 @@ class Reload:
         take: Callable[[], Certificate | None],
         count: Callable[[str], None],
         keys: KeyFiles | None,
+        certificate: Certificate | None,
     ) -> None:
         self._take, self._count, self._keys = take, count, keys
-        self._certificate = own_certificate(keys) if keys is not None else None
+        self._certificate = certificate
         self._taken_ns = self._changed_ns()
         self._ended = threading.Event()
         self._mutex = threading.Lock()

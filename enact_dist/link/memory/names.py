@@ -48,4 +48,4 @@ class UsedNames:
 def _parts(name: str) -> tuple[tuple[str, int], int]:
     session, _, digits = name.rpartition("-")
     number = int(digits, 16)
-    return (session, number >> SERIES_BITS), number
+    return (session, number >= FIRST_STAGED), number

@@ -6,6 +6,7 @@ import re
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
+from enact_dist.core.failover.lease import HolderRow
 from enact_dist.errors import StoreError
 
 LEASE_S_DEFAULT: Final = 2.0
@@ -34,19 +35,11 @@ class StoreAddress:
         return f"{without_password(self.url)} (shard {self.shard} of cell {self.cell})"
 
 
-class SeenRow(NamedTuple):
-    """A shard's row as it was last seen; a takeover is conditional on the first two."""
-
-    epoch: int
-    beat: int
-    holder: str = ""
-
-
 class FreeShard(NamedTuple):
     """A shard that no process held when it was last seen."""
 
     address: StoreAddress
-    seen: SeenRow
+    seen: HolderRow
 
 
 class ShardHeldError(StoreError):

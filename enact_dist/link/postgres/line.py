@@ -23,7 +23,7 @@ from enact_dist.link.postgres.tables import REACHED, RENEW, RESIGN
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from enact_dist.link.lease import Lease
+    from enact_dist.link.lease import HostLease
     from enact_dist.link.postgres.connection import Connector, DatabaseSession
 
 RENEW_S: Final = 0.4
@@ -41,7 +41,7 @@ class HeldRow(NamedTuple):
     connector: Connector
     shard: int
     epoch: int
-    lease: Lease
+    lease: HostLease
     name: str
 
 
@@ -128,16 +128,10 @@ class Line:
         """
         self.again(self._confirm, lambda _: False)
 
-    def reached(self, session: DatabaseSession) -> int:
-        """Return the number of the newest batch in the database.
-
-        Raises:
-            ShardTakenError: Another process has the shard.
-        """
+    def reached(self, session: DatabaseSession) -> tuple[int, int]:
+        """Return the epoch of the shard and its newest batch, as the database shows them."""
         found = session.row(REACHED, (self._tenure.shard,))
-        if found is None or found[0] != self._tenure.epoch:
-            raise self.taken()
-        return int(found[1])
+        return (found[0], found[1]) if found is not None else (0, 0)
 
     def resign(self) -> None:
         """Free the shard, so that a standby need not wait for the end of the lease."""

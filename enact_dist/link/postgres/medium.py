@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 import psycopg
 from psycopg.types.numeric import Int8
 
+from enact_dist.core.failover.lease import BrokenBatch, after_break
 from enact_dist.errors import StoreError
 from enact_dist.link.postgres.bodies import PART_BYTES, BodiesToWrite
 from enact_dist.link.postgres.connection import CONFIRMED, RECEIVED
@@ -93,10 +94,10 @@ class PostgresMedium:
             self._send(session, new, values)
 
         def done(session: DatabaseSession) -> bool:
-            reached = self.line.reached(session)
-            if reached not in {batch - 1, batch}:
+            became = after_break(self.line.reached(session), epoch=tenure.epoch, batch=batch)
+            if became is BrokenBatch.TAKEN:
                 raise self.line.taken()
-            return reached == batch
+            return became is BrokenBatch.STANDS
 
         self.line.again(act, done)
         self._failed = False

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 from psycopg.types.numeric import Int8
 
+from enact_dist.core.failover.lease import HolderRow
 from enact_dist.errors import StoreError
 from enact_dist.link.folder.folder import refuse
-from enact_dist.link.lease import Lease
-from enact_dist.link.postgres.address import SeenRow, ShardHeldError
+from enact_dist.link.lease import HostLease
+from enact_dist.link.postgres.address import ShardHeldError
 from enact_dist.link.postgres.bodies import ReadBodies
 from enact_dist.link.postgres.connection import CONFIRMED, Connector, myself
 from enact_dist.link.postgres.line import HeldRow, Renewer
@@ -38,7 +39,7 @@ def connector_of(address: StoreAddress) -> Connector:
     return Connector(address.url, f"enact {address.cell} {address.shard} on {myself()}")
 
 
-def look(session: DatabaseSession, address: StoreAddress) -> tuple[int, SeenRow]:
+def look(session: DatabaseSession, address: StoreAddress) -> tuple[int, HolderRow]:
     """Return a shard's row and who holds it; make the row and the tables if they are missing.
 
     Raises:
@@ -46,19 +47,17 @@ def look(session: DatabaseSession, address: StoreAddress) -> tuple[int, SeenRow]
         psycopg.Error: As the database reports it.
     """
     make_tables(session, address.cell, address.shard)
-    return _row(session, address)[:2]
+    return _row(session, address)
 
 
-def _row(
-    session: DatabaseSession, address: StoreAddress, more: str = ""
-) -> tuple[int, SeenRow, int]:
-    """Return the id of a shard's row, who holds it, and the number of its newest batch."""
+def _row(session: DatabaseSession, address: StoreAddress, more: str = "") -> tuple[int, HolderRow]:
+    """Return the id of a shard's row, and the row."""
     statement, values = state_of_shard(address.cell, address.shard)
     found = session.row(statement + more, values)
     if found is None:
         raise StoreError(f"{address} has gone from the database", path=str(address))
     shard, _, epoch, batch, beat, holder = found
-    return shard, SeenRow(epoch, beat, holder), batch
+    return shard, HolderRow(epoch, batch, beat, holder)
 
 
 def open_database(free: FreeShard, *, unix_s: int) -> tuple[Store, Recovered]:
@@ -80,7 +79,7 @@ def open_database(free: FreeShard, *, unix_s: int) -> tuple[Store, Recovered]:
     with database_errors(name):
         session = (connector := connector_of(address)).connect()
         try:
-            lease = Lease(address.lease_s)
+            lease = HostLease(address.lease_s)
             sent_s = lease.now_s()
             shard, epoch, batch = _fence(session, address, unix_s, seen)
             lease.confirmed(sent_s)
@@ -107,13 +106,13 @@ def _medium(session: DatabaseSession, tenure: HeldRow) -> PostgresMedium:
 
 
 def _fence(
-    session: DatabaseSession, address: StoreAddress, unix_s: int, seen: SeenRow
+    session: DatabaseSession, address: StoreAddress, unix_s: int, seen: HolderRow
 ) -> tuple[int, int, int]:
     """Begin a new epoch; return the shard's row, the epoch, and the number of the newest batch."""
     session.commit_as(CONFIRMED)
     with session.connection.transaction():
-        shard, now, batch = _row(session, address, " FOR UPDATE")
-        if now[:2] != seen[:2]:
+        shard, now = _row(session, address, " FOR UPDATE")
+        if (now.epoch, now.beat) != (seen.epoch, seen.beat):
             raise ShardHeldError(
                 f"{address} is served by process {now.holder or 'unknown'} in epoch {now.epoch}",
                 path=str(address),
@@ -121,7 +120,7 @@ def _fence(
         epoch = max(now.epoch + 1, unix_s)
         session.row(FENCE, (Int8(epoch), myself(), shard))
     session.check()
-    return shard, epoch, batch
+    return shard, epoch, now.batch
 
 
 class _Rows:

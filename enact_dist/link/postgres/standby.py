@@ -1,9 +1,7 @@
 """Waits until no other process holds a shard in a database.
 
-A holder changes its row's beat at least every 0.4 s.  Who waits counts the lease, and the drift of
-two clocks, from when it *saw* a beat, by its own monotonic clock: that is later than when the
-holder sent it.  After each new connection, and each look that took long, it counts anew, with time
-for the holder to connect again: while the database was away, no beat could change.
+A holder changes its row's beat at least every 0.4 s; `core.failover.lease` says when its lease is
+over.  A lost connection, and a look that took long, count as an outage of the database.
 """
 
 from __future__ import annotations
@@ -11,8 +9,8 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.link.lease import DRIFT
-from enact_dist.link.postgres.address import FreeShard, SeenRow, ShardHeldError
+from enact_dist.core.failover.lease import Standby
+from enact_dist.link.postgres.address import FreeShard, ShardHeldError
 from enact_dist.link.postgres.connection import LOST, myself
 from enact_dist.link.postgres.medium import database_errors, in_one_line
 from enact_dist.link.postgres.opening import connector_of, look
@@ -27,38 +25,6 @@ if TYPE_CHECKING:
 
 LOOK_S: Final = 0.1
 """How often the row is looked at."""
-RETURN_S: Final = 3.0
-"""How long the holder may take to connect again when the database was away."""
-
-
-class BeatWatch:
-    """Decides by what is seen of a shard's row whether it is free.  Pure but for its arguments.
-
-    Args:
-        lease_s: The lease of its holder.
-    """
-
-    def __init__(self, lease_s: float) -> None:
-        self._lease_s = lease_s
-        self._wait_s = lease_s * (1 + DRIFT)  # longer after an outage, until the holder is seen
-        self._seen: SeenRow | None = None
-        self._since_s = 0.0
-        self.alive = False
-
-    def was_away(self) -> None:
-        """Count anew: the database did not answer."""
-        self._seen = None
-        self._wait_s = (self._lease_s + RETURN_S) * (1 + DRIFT)
-
-    def is_free(self, seen: SeenRow, now_s: float) -> bool:
-        """Whether no process can answer for the shard, as of a look that ended at `now_s`."""
-        before = self._seen
-        if before is None or before[:2] != seen[:2]:
-            self.alive = before is not None
-            if self.alive:
-                self._wait_s = self._lease_s * (1 + DRIFT)
-            self._seen, self._since_s = seen, now_s
-        return not seen.holder or now_s - self._since_s > self._wait_s
 
 
 def wait_free(
@@ -83,7 +49,7 @@ def wait_free(
         StoreError: The database cannot be used, and this one is not patient.
     """
     connector = connector_of(address)
-    watch = BeatWatch(address.lease_s)
+    watch = Standby(round(address.lease_s * 1e9))
     session: DatabaseSession | None = None
     noted, told = "", False
     try:
@@ -99,7 +65,7 @@ def wait_free(
                 if not told and seen.holder:
                     told = True
                     session.row(NAME_ME, (name_of_standby(shard, myself()),))
-                if watch.is_free(seen, time.monotonic()):
+                if watch.is_free(seen, time.monotonic_ns()):
                     return FreeShard(address, seen)
                 answered = True
                 found = f"{address} is served by process {seen.holder}"

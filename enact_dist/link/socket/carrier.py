@@ -54,6 +54,7 @@ class SocketCarrier:
         behind: Reaches every shard; closed together with this carrier.
         session: The session that the connections speak for.
         identity: Owner of the session.
+        secret: Proves to a shard that the session is this process's own.
         forced: Whether an unusable socket is an error.
 
     Attributes:
@@ -62,12 +63,18 @@ class SocketCarrier:
     """
 
     def __init__(
-        self, behind: ZenohCarrier, session: str, identity: str, *, forced: bool = False
+        self,
+        behind: ZenohCarrier,
+        session: str,
+        identity: str,
+        secret: str = "",
+        *,
+        forced: bool = False,
     ) -> None:
         self.inside = False
         self.calls = {"socket": 0, "zenoh": 0}
         self._behind = behind
-        self._greeting = greeting_of(session, identity)
+        self._greeting = greeting_of(session, identity, secret)
         self._forced = forced
         self._pid = os.getpid()
         self._closed = False

@@ -13,6 +13,7 @@ import threading
 from typing import TYPE_CHECKING, Final, Protocol
 
 from enact_dist.core.protocol.messages import (
+    PERMISSION,
     Answer,
     Hello,
     Outcome,
@@ -22,7 +23,7 @@ from enact_dist.core.protocol.messages import (
     Survey,
 )
 from enact_dist.core.rights.rules import UNPROVEN, path_of
-from enact_dist.core.shard.owners import PERMISSION, SESSION_OF, not_yours
+from enact_dist.core.shard.owners import SESSION_OF, not_yours
 from enact_dist.errors import LinkError, PermissionDeniedError, ProtocolError
 from enact_dist.link.answers import encoded, size_of
 from enact_dist.link.notices import Interest
@@ -56,14 +57,14 @@ _log = logging.getLogger("enact.link")
 class Admission(Publisher, Protocol):
     """What a connection needs of the service that accepted it."""
 
-    def admit(self, connection: SocketConnection, session: str) -> None:
+    def admit(self, connection: SocketConnection, session: str, secret: str) -> None:
         """Admit a connection for a session; see `SocketService.admit`."""
 
     def left(self, connection: SocketConnection, session: str) -> None:
         """Record the end of an admitted connection."""
 
-    def is_of_another_process(self, session: str, peer: PeerCredentials) -> bool:
-        """Whether a session has connections from a process other than this one."""
+    def may_release(self, session: str, peer: PeerCredentials) -> bool:
+        """Whether a session has connections from this process, or has ended."""
 
 
 class SocketConnection:
@@ -129,9 +130,9 @@ class SocketConnection:
             return False
         if kind != FrameKind.OPEN or payload:
             raise ProtocolError(f"a frame of kind {kind} came instead of a greeting")
-        session, self.identity = read_greeting(header)
+        session, self.identity, secret = read_greeting(header)
         try:
-            self._service.admit(self, session)
+            self._service.admit(self, session, secret)
             self.session = session
         except LinkError as error:
             self._refuse(error)
@@ -204,7 +205,7 @@ class SocketConnection:
         everything else by identity.
         """
         if type(message) is Release:
-            return not self._service.is_of_another_process(session, self.peer)
+            return self._service.may_release(session, self.peer)
         return type(message) is Outcome
 
     def _take(self, answer: Answer) -> None:

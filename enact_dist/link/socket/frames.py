@@ -73,22 +73,23 @@ _KINDS: Final = frozenset(int(kind) for kind in FrameKind)
 _SKIPPED: Final = struct.Struct("<QQQ")
 
 
-def greeting_of(session: str, identity: str) -> bytes:
-    """Return the header that names a connection's session and identity."""
-    return f"{session} {quoted_identity(identity)}".encode()
+def greeting_of(session: str, identity: str, secret: str = "") -> bytes:
+    """Return the header that names a connection's session and identity, and opens the session."""
+    return f"{session} {quoted_identity(identity)} {secret}".rstrip().encode()
 
 
-def read_greeting(header: bytes) -> tuple[str, str]:
-    """Return the session and the identity of a connection.
+def read_greeting(header: bytes) -> tuple[str, str, str]:
+    """Return the session and the identity of a connection, and the session's secret.
 
     Raises:
         ProtocolError: The header is invalid.
     """
-    session, _, identity = header.decode("ascii", "replace").partition(" ")
+    session, _, rest = header.decode("ascii", "replace").partition(" ")
+    identity, _, secret = rest.partition(" ")
     fits = 0 < len(session) <= NAME_CHARACTERS_MAX and identity
     if not fits or quoted_identity(identity) != identity:
         raise ProtocolError("a connection did not name its session")
-    return session, identity
+    return session, identity, secret
 
 
 def skipped_frame(epoch: int, after: int, number: int) -> bytes:

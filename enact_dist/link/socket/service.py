@@ -19,12 +19,13 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.protocol.records import SessionDied
+from enact_dist.core.protocol.records import SessionBarred, SessionDied
 from enact_dist.core.shard.owners import is_shard, not_yours
 from enact_dist.errors import LinkError
 from enact_dist.link.socket.connection import SocketConnection
 from enact_dist.link.socket.frames import end_socket, prefixed
 from enact_dist.link.socket.peers import Deaths, PeerCredentials, check_peer
+from enact_dist.link.zenoh.access import opens
 from enact_dist.wire.frames import encode_frame
 from enact_dist.wire.keys import name_in
 
@@ -110,8 +111,8 @@ class SocketService:
                 self.host.count("connections_refused")
                 connected.close()
 
-    def admit(self, connection: SocketConnection, session: str) -> None:
-        """Admit a connection for a session.
+    def admit(self, connection: SocketConnection, session: str, secret: str) -> None:
+        """Admit a connection for a session, which its secret opens.
 
         Raises:
             LinkError: It is from another user, the session belongs to another process, or there are
@@ -124,6 +125,11 @@ class SocketService:
             raise LinkError(
                 f"process {peer.pid} of user {peer.user} called itself {asker}; shards call each"
                 " other over Zenoh"
+            )
+        if not opens(secret, session):
+            raise LinkError(
+                f"process {peer.pid} of user {peer.user} does not know the secret of session"
+                f" {session[:8]}; only the process that opened it does"
             )
         if owner and owner != asker:  # else the end of this process would end that session
             raise LinkError(not_yours(session, owner, asker).text)
@@ -148,7 +154,7 @@ class SocketService:
         self._deaths.connected(session, connection.connected)
 
     def take_rights(self) -> None:
-        """Let each connection use the rights that the shard has now, or end it."""
+        """Let each connection use the rights that the shard has now, or end it and its session."""
         with self._mutex:
             present = [one for mine in self._connections.values() for one in mine]
         for connection in present:
@@ -156,6 +162,7 @@ class SocketService:
                 connection.subject = self._subject_of(connection.identity, connection.peer)
             except LinkError as error:
                 _log.warning("connection of %s ended: %s", connection.identity, error)
+                self.host.event(SessionBarred(connection.session))
                 connection.end()
 
     def _subject_of(self, identity: str, peer: PeerCredentials) -> str | None:
@@ -200,10 +207,12 @@ class SocketService:
             return f"{CONNECTIONS_MAX} connections to shard {self.host.name} are open"
         return ""
 
-    def is_of_another_process(self, session: str, peer: PeerCredentials) -> bool:
-        """Whether a session has connections from a process other than this one."""
+    def may_release(self, session: str, peer: PeerCredentials) -> bool:
+        """Whether a session has connections from this process, or has ended."""
         with self._mutex:
-            return any(one.peer != peer for one in self._connections.get(session, ()))
+            if any(one.peer == peer for one in self._connections.get(session, ())):
+                return True
+        return session not in self.host.owners()
 
     def _has_its_share(self, peer: PeerCredentials) -> bool:
         """Whether a process must leave the free connections to others."""

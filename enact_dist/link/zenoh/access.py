@@ -10,7 +10,9 @@ In a cell with keys, the rules bind the name in the key of each request and toke
 the sender's certificate proves.  Names that the cell does not know may only ping, without a name,
 so that a client can tell a shard that is down from one that does not let it in.  A session's id
 ends with a mark of its owner's name (`session_of`): otherwise a client could greet a shard with the
-id of another one, which listings show, before that one does.
+id of another one, which listings show, before that one does.  The rest of the id is the hash of a
+secret that only shards of the client's own host hear, over their sockets: no other process can open
+a connection for the session, and so none can end it with its own end.
 
 Zenoh drops forbidden messages silently: a query gets no reply, a declaration reaches no peer.  A
 query passes only if its key is *included* in an allowed one, so a query with wildcards for several
@@ -51,6 +53,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 REVOKED_FILE: Final = "revoked.toml"
+SESSION_CHARACTERS: Final = 40
+"""Of a session's id: 32 of the hash of its secret, 8 of the mark of its owner's name."""
 ALL_PEERS: Final = "all-peers"
 EARLIER_QUESTION: Final = "await_stamp"
 """Discovery query of releases with frames before 7: the answer names our version."""
@@ -138,9 +142,27 @@ def actor_said(name: str, actor: str) -> str:
     return name if actor in {name, ""} else f"{name}:{actor}"[:NAME_CHARACTERS_MAX]
 
 
-def session_of(name: str) -> str:
-    """Return a new id for a session of a name."""
-    return secrets.token_hex(12) + _mark_of(name)
+def session_of(name: str, secret: str = "") -> str:
+    """Return a new id for a session of a name.
+
+    Its first part is the hash of `secret` (default: one that is not kept), which opens a shard's
+    socket for the session (`opens`).
+    """
+    return _hash_of(secret or secrets.token_hex(16)) + _mark_of(name)
+
+
+def _hash_of(secret: str) -> str:
+    return hashlib.blake2s(secret.encode(), digest_size=16).hexdigest()
+
+
+def opens(secret: str, session: str) -> bool:
+    """Say whether a secret opens a socket for a session.
+
+    An id of another length than those of `session_of` is no hash, and needs no secret.
+    """
+    if len(session) != SESSION_CHARACTERS:
+        return True
+    return secrets.compare_digest(_hash_of(secret), session[:32])
 
 
 @lru_cache(maxsize=1024)

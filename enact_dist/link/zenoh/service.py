@@ -27,9 +27,18 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import zenoh
 
-from enact_dist.core.protocol.messages import Answer, Fetch, Hello, Ping, Refused, Request, Stage
+from enact_dist.core.protocol.messages import (
+    PERMISSION,
+    Answer,
+    Fetch,
+    Hello,
+    Ping,
+    Refused,
+    Request,
+    Stage,
+)
 from enact_dist.core.protocol.records import SessionSeen
-from enact_dist.core.shard.owners import PERMISSION, named_session
+from enact_dist.core.shard.owners import named_session
 from enact_dist.errors import EnactError, PermissionDeniedError, ProtocolError
 from enact_dist.link.answers import encoded, size_of
 from enact_dist.link.memory.maps import recycle_blocks

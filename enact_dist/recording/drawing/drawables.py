@@ -21,7 +21,7 @@ from enact_dist.recording.drawing.parts import (
     part_at,
     parts_of,
 )
-from enact_dist.recording.drawing.solids import Capsule, capsule_of
+from enact_dist.recording.drawing.solids import Capsule, capsules_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -189,9 +189,9 @@ def _image(part: object, shows: Shows) -> ShownImage | None:
 def _mask(part: object, _: Shows) -> ShownImage | None:
     for array, beside in arrays_of(part):
         if array.ndim == 2 and array.dtype.kind + str(array.dtype.itemsize) in ("b1", "u1"):
-            if array is beside.get("packed") and array.dtype == np.uint8:
-                array = np.unpackbits(array, axis=1)  # noqa: PLW2901 - bits for pixels
-            return ShownImage(np.where(array != 0, np.uint8(255), np.uint8(0)), "mono8")
+            is_packed = array is beside.get("packed") and array.dtype == np.uint8
+            covers = np.unpackbits(array, axis=1) if is_packed else (array != 0).view(np.uint8)
+            return ShownImage(np.negative(covers, out=covers), "mono8")  # 1 becomes 255
     return None
 
 
@@ -233,7 +233,7 @@ def _voxels(part: object, shows: Shows) -> ShownVoxels | None:
 def _capsules(part: object, _: Shows) -> ShownCapsules | None:
     for array, _beside in arrays_of(part):
         if array.ndim == 2 and array.shape[1] == 7 and array.dtype.kind == "f":
-            return ShownCapsules(tuple(map(capsule_of, array[np.isfinite(array).all(axis=1)])))
+            return ShownCapsules(capsules_of(array[np.isfinite(array).all(axis=1)]))
     return None
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -25,8 +26,8 @@ def is_rigid(matrix: NDArray[Any]) -> bool:
         return False
     rotation = np.asarray(matrix[:3, :3], np.float64)
     return bool(
-        np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), atol=RIGID_TOLERANCE)
-        and np.allclose(rotation @ rotation.T, np.eye(3), atol=RIGID_TOLERANCE)
+        np.abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max() <= RIGID_TOLERANCE
+        and np.abs(rotation @ rotation.T - np.eye(3)).max() <= RIGID_TOLERANCE
         and np.linalg.det(rotation) > 0.0
     )
 
@@ -59,27 +60,18 @@ def quaternion(rotation: NDArray[Any]) -> tuple[float, float, float, float]:
 
     The largest of the four is computed first, so that nothing is divided by a small number.
     """
-    m = np.asarray(rotation, np.float64)
-    squares = np.array(
-        [
-            1.0 + m[0, 0] - m[1, 1] - m[2, 2],
-            1.0 - m[0, 0] + m[1, 1] - m[2, 2],
-            1.0 - m[0, 0] - m[1, 1] + m[2, 2],
-            1.0 + m[0, 0] + m[1, 1] + m[2, 2],
-        ]
+    (m00, m01, m02), (m10, m11, m12), (m20, m21, m22) = rotation.tolist()
+    yz, zx, xy = m21 - m12, m02 - m20, m10 - m01
+    products = (
+        (1.0 + m00 - m11 - m22, m01 + m10, m02 + m20, yz),
+        (m01 + m10, 1.0 - m00 + m11 - m22, m12 + m21, zx),
+        (m02 + m20, m12 + m21, 1.0 - m00 - m11 + m22, xy),
+        (yz, zx, xy, 1.0 + m00 + m11 + m22),
     )
-    products = np.array(
-        [
-            [squares[0], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[2, 1] - m[1, 2]],
-            [m[0, 1] + m[1, 0], squares[1], m[1, 2] + m[2, 1], m[0, 2] - m[2, 0]],
-            [m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], squares[2], m[1, 0] - m[0, 1]],
-            [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1], squares[3]],
-        ]
-    )
-    found = products[int(np.argmax(squares))]
-    found = found / np.linalg.norm(found)
-    x, y, z, w = (found if found[3] >= 0.0 else -found).tolist()
-    return x, y, z, w
+    largest = max(range(4), key=lambda at: products[at][at])
+    x, y, z, w = products[largest]
+    length = math.copysign(math.hypot(x, y, z, w), w)
+    return x / length, y / length, z / length, w / length
 
 
 def packed_points(

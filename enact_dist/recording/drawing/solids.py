@@ -108,17 +108,16 @@ class Capsule(NamedTuple):
     pose: NDArray[np.float64]
 
 
-def capsule_of(row: NDArray[Any]) -> Capsule:
-    """Return the capsule of a row (7,): end, end, radius."""
-    ends_m = np.asarray(row[:6], np.float64).reshape(2, 3)
-    along = ends_m[1] - ends_m[0]
-    length_m = float(np.linalg.norm(along))
-    pose = np.eye(4)
-    pose[:3, 3] = ends_m.mean(axis=0)
-    if length_m > 0.0:
-        z = along / length_m
-        aside = np.eye(3)[int(np.argmin(np.abs(z)))]
-        x = np.cross(aside, z)
-        x /= np.linalg.norm(x)
-        pose[:3, :3] = np.column_stack((x, np.cross(z, x), z))
-    return Capsule(ends_m, float(row[6]), length_m, pose)
+def capsules_of(rows: NDArray[Any]) -> tuple[Capsule, ...]:
+    """Return the capsules of rows (N, 7): end, end, radius."""
+    ends_m = np.asarray(rows[:, :6], np.float64).reshape(-1, 2, 3)
+    along = ends_m[:, 1] - ends_m[:, 0]
+    lengths_m = np.linalg.norm(along, axis=1)
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, 3] = ends_m.mean(axis=1)
+    long = lengths_m > 0.0
+    z = along[long] / lengths_m[long, None]
+    x = np.cross(np.eye(3)[np.argmin(np.abs(z), axis=1)], z)
+    x /= np.linalg.norm(x, axis=1)[:, None]
+    poses[long, :3, :3] = np.stack((x, np.cross(z, x), z), axis=2)
+    return tuple(map(Capsule, ends_m, rows[:, 6].tolist(), lengths_m.tolist(), poses))

@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
     count = arguments.seeds
     if count is None and seconds is None:
         count = SEEDS
-    with _progress(arguments, count, seconds) as on_progress:
+    with told_progress(arguments, count, seconds) as on_progress:
         totals = run_series(
             first,
             count=count,
@@ -199,7 +199,7 @@ def as_json(totals: Totals, found: list[Shrunk]) -> dict[str, object]:
 
 
 @contextmanager
-def _progress(
+def told_progress(
     arguments: argparse.Namespace, count: int | None, seconds: float | None
 ) -> Iterator[Callable[[Totals], None]]:
     """Show a bar on a terminal; nothing in a pipe, and nothing beside JSON."""

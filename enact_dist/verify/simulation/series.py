@@ -74,6 +74,11 @@ class Totals:
         return sum(n for name, n in self.tally.items() if name.startswith("partitions"))
 
 
+def run_scenario(seed: int) -> Result:
+    """Run one seed of the whole cell."""
+    return Scenario(seed).run()
+
+
 def run_series(
     first: int,
     *,
@@ -84,6 +89,7 @@ def run_series(
     step: int = 1,
     keep_going: bool = False,
     on_progress: Callable[[Totals], None] = lambda _totals: None,
+    run: Callable[[int], Result] = run_scenario,
 ) -> Totals:
     """Run seeds until enough have run, the time is over or one breaks a rule.
 
@@ -96,6 +102,7 @@ def run_series(
         step: From one seed to the next.
         keep_going: Do not stop at a broken rule.
         on_progress: Called after every seed.
+        run: Runs one seed; a function of a module, since other processes call it.
     """
     totals, started_s = Totals(first), time.monotonic()
 
@@ -111,7 +118,8 @@ def run_series(
             yield first + number * step
 
     try:
-        for result, cpu_s in _here(wanted()) if jobs == 1 else _on_processes(wanted(), jobs):
+        results = _here(run, wanted()) if jobs == 1 else _on_processes(run, wanted(), jobs)
+        for result, cpu_s in results:
             totals.add(result, cpu_s)
             on_progress(totals)
     except KeyboardInterrupt:
@@ -120,20 +128,22 @@ def run_series(
     return totals
 
 
-def _run(seed: int) -> tuple[Result, float]:
+def _run(run: Callable[[int], Result], seed: int) -> tuple[Result, float]:
     before_s = time.process_time()
-    result = Scenario(seed).run()
+    result = run(seed)
     if not result.violation:
         result = replace(result, faults=(), locks=())
     return result, time.process_time() - before_s
 
 
-def _here(seeds: Iterator[int]) -> Iterator[tuple[Result, float]]:
+def _here(run: Callable[[int], Result], seeds: Iterator[int]) -> Iterator[tuple[Result, float]]:
     for seed in seeds:
-        yield _run(seed)
+        yield _run(run, seed)
 
 
-def _on_processes(seeds: Iterator[int], jobs: int) -> Iterator[tuple[Result, float]]:
+def _on_processes(
+    run: Callable[[int], Result], seeds: Iterator[int], jobs: int
+) -> Iterator[tuple[Result, float]]:
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_ignore_interrupts)
     under_way: set[Future[tuple[Result, float]]] = set()
@@ -141,7 +151,7 @@ def _on_processes(seeds: Iterator[int], jobs: int) -> Iterator[tuple[Result, flo
         while True:
             # One more than there are processes, so that none waits for its next seed.
             for seed in itertools.islice(seeds, jobs + 1 - len(under_way)):
-                under_way.add(pool.submit(_run, seed))
+                under_way.add(pool.submit(_run, run, seed))
             if not under_way:
                 return
             done, under_way = wait(under_way, return_when=FIRST_COMPLETED)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from enact_dist.recording.drawing.geometry import is_rigid
-from enact_dist.recording.drawing.solids import Capsule, capsule_of
+from enact_dist.recording.drawing.solids import Capsule, capsules_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -33,17 +33,15 @@ def arm_capsules(model: object, positions_rad: NDArray[Any]) -> tuple[Capsule, .
     ):
         return None
     poses = [np.asarray(base, np.float64)]
-    for (along, aside, tilt, zero), position in zip(rows, positions_rad, strict=True):  # type: ignore[arg-type]
-        poses.append(poses[-1] @ _step(along, aside, tilt, zero + float(position)))
-    found = []
-    for first, first_m, second, second_m, radius_m in shapes:  # type: ignore[union-attr]
-        if not (0 <= first <= count and 0 <= second <= count):
-            return None
-        ends = [
-            poses[int(at)] @ (0, 0, z_m, 1) for at, z_m in ((first, first_m), (second, second_m))
-        ]
-        found.append(capsule_of(np.array([*ends[0][:3], *ends[1][:3], radius_m])))
-    return tuple(found)
+    for step in _steps(rows, positions_rad):  # type: ignore[arg-type]
+        poses.append(poses[-1] @ step)
+    first, first_m, second, second_m, radius_m = np.asarray(shapes, np.float64).T
+    if min(first.min(), second.min()) < 0 or max(first.max(), second.max()) > count:
+        return None
+    frames = np.stack(poses)[np.stack((first, second), axis=1).astype(int)]
+    along_m = np.stack((first_m, second_m), axis=1)[:, :, None]
+    ends_m = frames[:, :, :3, 3] + along_m * frames[:, :, :3, 2]
+    return capsules_of(np.column_stack((ends_m.reshape(-1, 6), radius_m)))
 
 
 def _is_table(value: object, columns: int) -> bool:
@@ -56,15 +54,19 @@ def _is_table(value: object, columns: int) -> bool:
     )
 
 
-def _step(along_m: float, aside_m: float, tilt_rad: float, turn_rad: float) -> NDArray[np.float64]:
-    """Return where the frame behind a joint is in the one before it, classic Denavit-Hartenberg."""
-    c, s = np.cos(turn_rad), np.sin(turn_rad)
+def _steps(rows: NDArray[Any], positions_rad: NDArray[Any]) -> NDArray[np.float64]:
+    """Return where the frame behind each joint is in the one before it, (J, 4, 4).
+
+    The rows are classic Denavit-Hartenberg.
+    """
+    along_m, aside_m, tilt_rad, zero_rad = np.asarray(rows, np.float64).T
+    c, s = np.cos(zero_rad + positions_rad), np.sin(zero_rad + positions_rad)
     cos_tilt, sin_tilt = np.cos(tilt_rad), np.sin(tilt_rad)
-    return np.array(
-        [
-            [c, -s * cos_tilt, s * sin_tilt, aside_m * c],
-            [s, c * cos_tilt, -c * sin_tilt, aside_m * s],
-            [0.0, sin_tilt, cos_tilt, along_m],
-            [0.0, 0.0, 0.0, 1.0],
-        ]
-    )
+    none, one = np.zeros(len(rows)), np.ones(len(rows))
+    columns = [
+        [c, -s * cos_tilt, s * sin_tilt, aside_m * c],
+        [s, c * cos_tilt, -c * sin_tilt, aside_m * s],
+        [none, sin_tilt, cos_tilt, along_m],
+        [none, none, none, one],
+    ]
+    return np.moveaxis(np.array(columns), 2, 0)

@@ -89,6 +89,7 @@ class ShownDatum:
         shows: What its aspect is shown as.
         drawables: By kind; None: the datum does not fit it.
         made: Nodes and small images made of it, so that several pages share them.
+        frame: Where it stands.
     """
 
     recorded: Recorded
@@ -96,6 +97,10 @@ class ShownDatum:
     shows: Shows
     drawables: dict[str, Drawable | None]
     made: dict[object, Any] = field(default_factory=dict)
+    frame: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.frame = self.shows.frame_of(self.recorded.slot.entity)
 
 
 def shown_of(recorded: Recorded, shows: Shows) -> ShownDatum:
@@ -173,8 +178,7 @@ def _transforms(data: Iterable[ShownDatum]) -> Iterator[tuple[str, InParent]]:
     for shown in data:
         found, entity = shown.drawables.get("transform"), shown.recorded.slot.entity
         if isinstance(found, ShownTransform):
-            parent = shown.shows.parent_of(entity)
-            yield shown.shows.frame_of(entity), InParent(parent, found.matrix)
+            yield shown.frame, InParent(shown.shows.parent_of(entity), found.matrix)
 
 
 def _made(
@@ -183,8 +187,7 @@ def _made(
     """Return the node of a drawable, made once; None if it is none, or empty."""
     key = ("node", kind, tint)
     if key not in shown.made:
-        frame = shown.shows.frame_of(shown.recorded.slot.entity)
-        shown.made[key] = _node(frame, drawable, tint)
+        shown.made[key] = _node(shown.frame, drawable, tint)
     node: Node | None = shown.made[key]
     return node
 
@@ -243,13 +246,12 @@ def _arm(
     known = shown.made.get(key)
     if known is None:
         _forget_older(shown.made, "arm")
-        frame = shown.shows.frame_of(shown.recorded.slot.entity)
         node: Node | None = None
         if isinstance(described, Robot):
             poses = described.poses(joints, named=bool(shown.shows.joints))
-            node = RobotNode(frame, described.shapes, poses, tint) if len(poses) else None
+            node = RobotNode(shown.frame, described.shapes, poses, tint) if len(poses) else None
         elif capsules := arm_capsules(described.value, joints.positions):
-            node = CapsulesNode(frame, capsules, tint or ARM_COLOUR)
+            node = CapsulesNode(shown.frame, capsules, tint or ARM_COLOUR)
         known = shown.made[key] = node, described  # referenced, so that its id stays its own
     arm: Node | None = known[0]
     return arm
@@ -318,11 +320,10 @@ class _Camera:
 def _cameras(data: Mapping[Slot, ShownDatum], tints: Mapping[Slot, Colour]) -> dict[str, _Camera]:
     cameras: dict[str, _Camera] = {}
     for slot, shown in data.items():
-        frame = shown.shows.frame_of(slot.entity)
         for kind, drawable in shown.drawables.items():
             if not isinstance(drawable, ShownImage | ShownCamera):
                 continue
-            camera = cameras.setdefault(frame, _Camera(frame))
+            camera = cameras.setdefault(shown.frame, _Camera(shown.frame))
             camera.tint = tints.get(slot, camera.tint)
             if kind == "image" and camera.image is not None:
                 first = camera.image.recorded.slot

@@ -72,20 +72,19 @@ class Canvas:
                 again.
         """
         sent = 0
-        with self._client.atomic():
-            wanted = {f"{side}{name}" for side, scene in scenes.items() for name in scene.nodes}
-            for name in [name for name in self._drawn if name not in wanted]:
-                self._drawn.pop(name)[1].remove()
-                self._numbers.pop(name, None)
-            for side, scene in scenes.items():
-                for frame, pose in scene.frames.items():
-                    self._place(f"{side}{frame}", pose)
-                for name, node in scene.nodes.items():
-                    known = self._drawn.get(f"{side}{name}")
-                    if known is None or not _is_same(known[0], node):
-                        self._send(f"{side}{name}", f"{side}{node.frame}", node)
-                        sent += 1
-            self._leave(scenes)
+        wanted = {f"{side}{name}" for side, scene in scenes.items() for name in scene.nodes}
+        for name in [name for name in self._drawn if name not in wanted]:
+            self._drawn.pop(name)[1].remove()
+            self._numbers.pop(name, None)
+        for side, scene in scenes.items():
+            for frame, pose in scene.frames.items():
+                self._place(f"{side}{frame}", pose)
+            for name, node in scene.nodes.items():
+                known = self._drawn.get(f"{side}{name}")
+                if known is None or not _is_same(known[0], node):
+                    self._send(f"{side}{name}", f"{side}{node.frame}", node)
+                    sent += 1
+        self._leave(scenes)
         return sent
 
     def _leave(self, scenes: Mapping[str, SceneView]) -> None:
@@ -164,6 +163,11 @@ class Canvas:
         if isinstance(node, AxesNode) and isinstance(before, AxesNode):
             handle.wxyz, handle.position = _pose(node.matrix)
             return before.colour == node.colour
+        if isinstance(node, PointsNode) and isinstance(before, PointsNode):
+            one_colour = isinstance(node.colours, tuple) and isinstance(before.colours, tuple)
+            if one_colour and (before.colours, before.size_m) == (node.colours, node.size_m):
+                handle.points = node.points_m
+                return True
         if isinstance(node, CapsulesNode) and isinstance(before, CapsulesNode):
             same_shapes = len(before.capsules) == len(node.capsules)
         elif isinstance(node, RobotNode) and isinstance(before, RobotNode):

@@ -176,8 +176,7 @@ class PageContents:
         shown: dict[Slot, ShownDatum] = {}
         unfit = "; ".join(why for _, why in found.denied[:1])
         for slot, recorded in found.data.items():
-            version = (recorded.version, recorded.stamp_ns)
-            if slot in known and (known[slot].version, known[slot].stamp_ns) == version:
+            if slot in known and known[slot].state == recorded.state:
                 shown[slot] = before[slot]
                 continue
             try:

@@ -33,6 +33,9 @@ _log = logging.getLogger(__name__)
 
 LISTED_S: Final = 0.5
 """How often tables are made anew."""
+FILLING_S: Final = 0.02
+FILLED_S: Final = 1.0
+"""How often, and how long after an event, a page looks for what its new rows lack."""
 RATE_WINDOW_S: Final = 3.0
 UP: Final = ".."
 FITTED_S: Final = 2.0
@@ -59,8 +62,9 @@ class Page:
         self._listing: Listing | None = None
         self._drawable: list[Slot] = []
         self._listed_s = self._ticked_s = 0.0
+        self._lacking: list[Slot] = []
         self._fits = 2
-        self._begun_s = time.monotonic()
+        self._begun_s = self._acted_s = time.monotonic()
         self._draws: deque[float] = deque()
         self._remarks: tuple[str, ...] = ()
         self._thread = threading.Thread(target=self._run, name="view page", daemon=True)
@@ -88,12 +92,14 @@ class Page:
                 self._failed = self._guarded(self._tick)
                 took_s = time.monotonic() - begun_s
                 # At most half of the time is spent here, however much there is to draw.
-                self._take_events(begun_s + max(1.0 / self._viewer.rate_hz, 2.0 * took_s))
+                rested_s = begun_s + 2.0 * took_s
+                period_s = FILLING_S if self._fills else 1.0 / self._viewer.rate_hz
+                self._take_events(rested_s, max(begun_s + period_s, rested_s))
         finally:
             self._viewer.feed.wish(self, None)
             self._viewer.list_for(self, None)
 
-    def _take_events(self, until_s: float) -> None:
+    def _take_events(self, rested_s: float, until_s: float) -> None:
         while not self._closed and (left_s := until_s - time.monotonic()) > 0.0:
             try:
                 events = [self._events.get(timeout=left_s)]
@@ -108,6 +114,10 @@ class Page:
                     self._said, self._listed_s = "", 0.0
                     act = getattr(self, f"_on_{name.replace(' ', '_')}")
                     self._said = self._guarded(act, value) or self._said
+                    now_s = time.monotonic()
+                    if now_s > self._acted_s + 1.0 / self._viewer.rate_hz:
+                        until_s = rested_s  # a click is shown at once, a drag at the rate
+                    self._acted_s = now_s
 
     def _guarded(self, act: Any, *given: Any) -> str:
         """Do something; show on the page what goes wrong, and return it."""
@@ -159,16 +169,31 @@ class Page:
                 self._samples.add(data[slot])
         shown = {slot: data[slot] for slot in (*drawn, *labelled) if slot in data}
         whole = len(shown) >= len(drawn) or now_s > self._begun_s + FITTED_S
-        self._draw(shown, fits=self._fits > (0 if whole else 1))
-        if listing_due and player.live:
-            contents.learn_history(self._of_history())
+        scenes = contents.scenes(shown)
         line = player.timeline
-        self._time.range(line.span_s, line.span_s if player.live else line.seconds(player.at_ns))
-        if listing_due:
-            self._show_panels(data)
+        with self._client.atomic():  # sent at once: each message alone costs as much as all
+            self._draw(scenes, fits=self._fits > (0 if whole else 1))
+            at_s = line.span_s if player.live else line.seconds(player.at_ns)
+            self._time.range(line.span_s, at_s)
+            lacking = [slot for slot in self._rows() if self._lacks(slot, rows, data)]
+            if listing_due or lacking != self._lacking:
+                self._lacking = lacking
+                self._show_panels(data)
+        if listing_due and player.live and not self._fills:
+            contents.learn_history(self._of_history())
 
-    def _draw(self, data: dict[Slot, ShownDatum], *, fits: bool) -> None:
-        scenes = self.contents.scenes(data)
+    @property
+    def _fills(self) -> bool:
+        """Whether what an event has listed is still to come."""
+        return bool(self._lacking) and time.monotonic() < self._acted_s + FILLED_S
+
+    def _lacks(self, slot: Slot, followed: list[Slot], data: Mapping[Slot, ShownDatum]) -> bool:
+        """Whether a listed datum will have a size or a value that have not come yet."""
+        if self._viewer.cell is None:
+            return False
+        return self._viewer.entry(slot) is None or (slot in followed and slot not in data)
+
+    def _draw(self, scenes: dict[str, SceneView], *, fits: bool) -> None:
         if fits and scenes[""].nodes:
             self._fit(scenes[""])
         if self._canvas.draw(scenes):
@@ -285,7 +310,11 @@ class Page:
         if self._datum is not None and source is not None:
             entry = self._viewer.entry(self._datum)
             if entry is not None and entry.state.size <= SMALL_BYTES:
-                self._samples.learn(source, self._datum)
+                self._send("history", self._datum)  # after the datum itself is shown
+
+    def _on_history(self, slot: Slot) -> None:
+        if self._viewer.cell is not None:
+            self._samples.learn(self._viewer.cell, slot)
 
     def _on_layer(self, box: tuple[str, bool]) -> None:
         aspect, is_on = box

@@ -31,13 +31,13 @@ from enact_dist.verify.simulation.hosts.keeping import KeptLocks, Sight, Stop
 from enact_dist.verify.simulation.hosts.world import MS, Host, S
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from enact_dist.core.client.lock import MultiLock
     from enact_dist.core.protocol.datum import Datum, Slot
     from enact_dist.verify.simulation.faults import Faults
     from enact_dist.verify.simulation.hosts.network import Network
-    from enact_dist.verify.simulation.hosts.shard_host import ShardNode
+    from enact_dist.verify.simulation.hosts.shard_host import ShardPlace
     from enact_dist.verify.simulation.hosts.world import SimulatedWorld
 
 CALL_NS = S
@@ -82,7 +82,7 @@ class ClientNode(Host):
         name: str,
         *,
         network: Network,
-        shards: dict[str, ShardNode],
+        shards: Mapping[str, ShardPlace],
         check_beliefs: Callable[[ClientNode], None],
         faults: Faults,
         ttl_ns: int,

@@ -22,7 +22,7 @@ from enact_dist.verify.simulation.hosts.payloads import ShardPayloads, as_kept
 from enact_dist.verify.simulation.hosts.world import MS, Host, S
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from random import Random
 
     from enact_dist.core.protocol.records import Effect, Event, Recovered
@@ -53,7 +53,17 @@ class ShardJudge(Protocol):
         """A shard has taken a message and decided."""
 
 
-class ShardNode(Host):
+class ShardPlace(Host):
+    """Where requests to a shard go."""
+
+    marks: SimulatedMarks | None = None
+
+    def request(self, message: Request, reply: Callable[[Answer], None]) -> None:
+        """Hand a request to the shard."""
+        raise NotImplementedError
+
+
+class ShardNode(ShardPlace):
     """A shard daemon.  `asked` are the requests that it has not answered yet, by their handles."""
 
     def __init__(
@@ -70,13 +80,12 @@ class ShardNode(Host):
         self.shard: Shard
         self.payloads: ShardPayloads
         self.keeps = False
-        self.marks: SimulatedMarks | None = None
         self.between: Callable[[str], None] = lambda _session: None
         self.tokens: Callable[[ShardNode], list[str]] = lambda _host: []
         self.on_persist: Callable[[ShardNode], None] = lambda _host: None
         self.on_decision: Callable[[ShardNode, list[str]], None] = lambda _host, _told: None
         self.network: Network
-        self.peers: dict[str, ShardNode] = {}
+        self.peers: Mapping[str, ShardPlace] = {}
         self.asked: dict[int, Request] = {}
         self._replies: dict[int, Callable[[Answer], None]] = {}
         self._handle = self._steps = 0
@@ -91,7 +100,10 @@ class ShardNode(Host):
         """Start with what the disk has kept."""
         self.up = True
         self.clock = self.new_clock()
-        recovered = self.disk.recovered(unix_s=self.wall_ns // S)
+        self.serve(self.disk.recovered(unix_s=self.wall_ns // S))
+
+    def serve(self, recovered: Recovered) -> None:
+        """Serve what a store held when it was opened."""
         self._replies.clear()
         self.asked.clear()
         self.shard = Shard(self.settings, recovered, now_ns=self.local_ns, wall_ns=self.wall_ns)
@@ -205,6 +217,14 @@ class ShardNode(Host):
         if self.asserts and self._steps % ASSERT_EVERY == 0:
             self.shard.assert_invariants()
         self.judge.handled(self, message, effects)
+        self.carry_out(effects)
+        told = [e.shard for e in effects if isinstance(e, Call) and isinstance(e.request, Finish)]
+        if told:
+            self.on_decision(self, told)
+        self._plan_tick()
+
+    def carry_out(self, effects: Sequence[Effect]) -> None:
+        """Answer, write and ask, in this order of the core's."""
         for effect in effects:
             if isinstance(effect, Reply):
                 reply = self._replies.pop(effect.reply_to, None)
@@ -216,14 +236,14 @@ class ShardNode(Host):
                     self.world.tally[f"refused: {effect.answer.code}"] += 1
                 reply(cast("Answer", effect.answer))
             elif isinstance(effect, Persist):
-                self.disk.submit(self, effect, lambda ticket: self.event(Persisted(ticket)))
-                self.on_persist(self)
+                self.persist(effect)
             elif isinstance(effect, Call):
                 self._call(effect)
-        told = [e.shard for e in effects if isinstance(e, Call) and isinstance(e.request, Finish)]
-        if told:
-            self.on_decision(self, told)
-        self._plan_tick()
+
+    def persist(self, persist: Persist) -> None:
+        """Write, and let the shard know once it survives what it must."""
+        self.disk.submit(self, persist, lambda ticket: self.event(Persisted(ticket)))
+        self.on_persist(self)
 
     def _call(self, call: Call) -> None:
         """Ask another shard over the same bad network; no answer needs no report."""

@@ -56,10 +56,10 @@ class SimulatedWorld:
     story: list[tuple[int, str]] | None = None
     tally: Counter[str] = field(default_factory=Counter)
     winding_down: bool = False
-    _events: list[tuple[int, int, Callable[[], None]]] = field(default_factory=list)
+    _events: list[tuple[int, int, Callable[[], object]]] = field(default_factory=list)
     _number: int = 0
 
-    def after(self, delay_ns: int, action: Callable[[], None]) -> None:
+    def after(self, delay_ns: int, action: Callable[[], object]) -> None:
         """Let `action` happen `delay_ns` of true time from now."""
         self._number += 1
         heapq.heappush(self._events, (self.now_ns + max(0, delay_ns), self._number, action))

@@ -1,0 +1,1 @@
+"""Two daemons per shard and a replicated database, simulated: nothing acknowledged may be lost."""
