@@ -43,7 +43,7 @@ def test_a_look_that_the_database_kept_waiting_counts_for_nothing(server, stores
     looks, found = [], []
 
     def stand_by():
-        arguments = {"patient": True, "note": print, "looked": lambda: looks.append(1)}
+        arguments = {"patient": True, "note": print, "looked": lambda _: looks.append(1)}
         found.append(wait_free(address, stopped=threading.Event(), **arguments))
         found.append(time.monotonic())
 
