@@ -58,6 +58,27 @@ def test_a_store_goes_on_at_the_promoted_standby(nodes, stores):
     assert medium.line.reconnects >= 1
 
 
+def test_a_server_that_hangs_is_left_for_the_promoted_one(nodes, stores):
+    """Its processes stand still, and its host answers for it: no connection breaks."""
+    first, second = nodes
+    address = address_of(both(nodes), lease_s=60.0)
+    store, recovered, medium = stores.open(address)
+    store.write([state(1)])
+    first.pause()
+    try:
+        second.promote()
+        store.write([state(2)])
+        assert medium.line.reconnects >= 1
+        store.close()
+    finally:
+        first.go_on()
+        first.stop("immediate")
+
+    _, again, _ = stores.open(address)
+    assert again.epoch == recovered.epoch + 1
+    assert versions(again) == {"a": 2}
+
+
 def test_a_store_ends_in_time_without_an_answer_of_its_database(pair, stores):
     """A commit that waits for the standby is not acknowledged, and keeps no daemon from its end."""
     second = pair[1]

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import os
 import socket
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from typing import TYPE_CHECKING, Any, Final
 
 import psycopg
@@ -22,9 +22,11 @@ from psycopg.conninfo import conninfo_to_dict
 
 from enact_dist.errors import StoreError
 from enact_dist.link.postgres.address import without_password
+from enact_dist.link.postgres.lookout import Lookout
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from contextlib import AbstractContextManager
 
 CONNECT_S: Final = 2
 """How long one host may take to answer a connection."""
@@ -67,6 +69,7 @@ class Connector:
         self._ports = ports if len(ports) == len(self._hosts) else ports[:1] * len(self._hosts)
         options = f"{found.pop('options', '') or ''} {_OPTIONS}".strip()
         self._rest = {**found, **_KEYWORDS, "options": options, "application_name": who}
+        self._lookout = Lookout(self) if len(self._hosts) > 1 else None
 
     def connect(self) -> DatabaseSession:
         """Connect.
@@ -85,6 +88,27 @@ class Connector:
             for some in (self._hosts, self._ports):
                 some.insert(0, some.pop(at))
         return DatabaseSession(connection)
+
+    def waiting(self, session: DatabaseSession) -> AbstractContextManager[None]:
+        """Return a context in which a session is left whose server hangs; see `lookout`."""
+        return self._lookout.over(session) if self._lookout is not None else nullcontext()
+
+    @staticmethod
+    def host_of(session: DatabaseSession) -> str:
+        """Return the host and port of a session."""
+        info = session.connection.info
+        return f"{info.host}:{info.port}"
+
+    def primary_beside(self, session: DatabaseSession) -> str:
+        """Return another host that takes writes, "" if there is none."""
+        here = self.host_of(session)
+        for host, port in zip(tuple(self._hosts), tuple(self._ports), strict=True):
+            if f"{host}:{port}" == here:
+                continue
+            place = {"host": host, **({"port": port} if port else {})}
+            with suppress(psycopg.Error), psycopg.connect(**{**self._rest, **place}):
+                return f"{host}:{port}"
+        return ""
 
 
 class DatabaseSession:

@@ -99,12 +99,13 @@ class Line:
             try:
                 session = self._connected()
                 sent_s = tenure.lease.now_s()
-                if uncertain and done(session):
-                    self._confirm(session)
-                else:
-                    uncertain = True
-                    act(session)
-                    session.check()
+                with tenure.connector.waiting(session):
+                    if uncertain and done(session):
+                        self._confirm(session)
+                    else:
+                        uncertain = True
+                        act(session)
+                        session.check()
             except errors.DivisionByZero:
                 # Another has the shard, or an earlier try was committed while this one waited.
                 continue

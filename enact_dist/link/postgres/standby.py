@@ -59,7 +59,8 @@ def wait_free(
                 if session is None:
                     session, told = connector.connect(), False
                 began_s = time.monotonic()
-                shard, seen = look(session, address)
+                with connector.waiting(session):
+                    shard, seen = look(session, address)
                 if time.monotonic() - began_s > address.lease_s / 2:
                     watch.was_away()
                 if not told and seen.holder:
