@@ -1,6 +1,5 @@
 """The database's primary goes, and its standby is promoted: the store goes on in the same epoch."""
 
-import shutil
 import threading
 import time
 
@@ -15,17 +14,8 @@ from enact_dist.link.postgres.line import CLOSE_S
 @pytest.fixture
 def nodes():
     """A pair of the test's own, for it ends otherwise than it began."""
-    folder = postgres_nodes.make_folder()
-    nodes = [postgres_nodes.Node(folder, name) for name in ("first", "second")]
-    try:
-        nodes[0].init()
-        nodes[0].start()
-        postgres_nodes.replicate(*nodes)
+    with postgres_nodes.two_nodes() as nodes:
         yield nodes
-    finally:
-        for node in reversed(nodes):
-            node.close()
-        shutil.rmtree(folder)
 
 
 def both(nodes):
