@@ -97,3 +97,41 @@ def test_a_store_ends_in_time_without_an_answer_of_its_database(pair, stores):
     assert "the shard ends" in str(failed[0])
     assert CLOSE_S <= took_s < CLOSE_S + 5
     postgres_nodes.await_sync(pair[0])
+
+
+def test_a_store_that_ends_waits_for_no_second_connection(pair, stores, monkeypatch):
+    """Its connection was lost as it was told to end, and the database's standby is away."""
+    first, second = pair
+    address = address_of(first.url, lease_s=60.0)
+    store, _, medium = stores.open(address)
+    store.write([state(1)])
+    connect = medium._tenure.connector.connect
+
+    def slowly():
+        time.sleep(1.5 * CLOSE_S)  # a host before the one that answers is dead
+        return connect()
+
+    monkeypatch.setattr(medium._tenure.connector, "connect", slowly)
+    failed = []
+
+    def write():
+        with pytest.raises(StoreError) as found:
+            store.write([state(2)])
+        failed.append(found.value)
+
+    second.pause()
+    try:
+        writer = threading.Thread(target=write)
+        writer.start()
+        writer.join(0.3)
+        medium.line._session.break_off()
+        asked_s = time.monotonic()
+        medium.end_soon()
+        writer.join(20)
+        store.close()
+        took_s = time.monotonic() - asked_s
+    finally:
+        second.go_on()
+    assert "the shard ends" in str(failed[0])
+    assert took_s < 4 * CLOSE_S
+    postgres_nodes.await_sync(first)

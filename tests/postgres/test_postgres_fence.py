@@ -166,7 +166,8 @@ def test_a_shard_without_a_sign_is_free_after_the_lease(server, stores):
     assert versions(recovered) == {"a": 1}
 
 
-def test_the_own_batch_that_ended_late_is_not_taken_for_anothers(pair, stores):
+@pytest.mark.parametrize("body", [b"", bytes(200_000)], ids=["small", "large"])
+def test_the_own_batch_that_ended_late_is_not_taken_for_anothers(pair, stores, body):
     """Its connection is lost while it waits for the standby: the next try finds it there."""
     first, second = pair
     with TcpProxy(first.port) as proxy:
@@ -176,7 +177,7 @@ def test_the_own_batch_that_ended_late_is_not_taken_for_anothers(pair, stores):
         medium._renewer.close()
         second.pause()
         try:
-            writer = threading.Thread(target=store.write, args=([state(2)],))
+            writer = threading.Thread(target=store.write, args=([state(2, body=body)],))
             writer.start()
             await_waiting(first)
             proxy.cut()

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
+from enact_dist.config.types import without_password
 from enact_dist.core.failover.lease import HolderRow
 from enact_dist.errors import StoreError
 
 LEASE_S_DEFAULT: Final = 2.0
 """How long a shard may answer after its last confirmed write, seconds."""
-_PASSWORD: Final = re.compile(r"(?<=://)([^/@:]*):[^/@]*@|([?&])password=[^&]*")
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,8 +58,3 @@ def require_driver(url: str) -> None:
             f"the store {without_password(url)} needs psycopg, which cannot be imported ({error}):"
             " pip install -e '.[postgres]' in the clone of enact-dist"
         ) from error
-
-
-def without_password(url: str) -> str:
-    """Return the URL of a database for people."""
-    return _PASSWORD.sub(lambda found: f"{found[1]}@" if found[1] is not None else "", url)

@@ -20,8 +20,8 @@ import psycopg
 from psycopg import errors
 from psycopg.conninfo import conninfo_to_dict
 
+from enact_dist.config.types import without_password
 from enact_dist.errors import StoreError
-from enact_dist.link.postgres.address import without_password
 from enact_dist.link.postgres.lookout import Lookout
 
 if TYPE_CHECKING:
@@ -64,12 +64,14 @@ class Connector:
     def __init__(self, url: str, who: str) -> None:
         self.shown = without_password(url)
         found = conninfo_to_dict(url)
-        self._hosts = str(found.pop("host", "") or "").split(",")
+        hosts = str(found.pop("host", "") or "").split(",")
         ports = str(found.pop("port", "") or "").split(",")
-        self._ports = ports if len(ports) == len(self._hosts) else ports[:1] * len(self._hosts)
+        ports = ports if len(ports) == len(hosts) else ports[:1] * len(hosts)
+        # Several threads connect: it is replaced as a whole, never changed.
+        self._places = tuple(zip(hosts, ports, strict=True))
         options = f"{found.pop('options', '') or ''} {_OPTIONS}".strip()
         self._rest = {**found, **_KEYWORDS, "options": options, "application_name": who}
-        self._lookout = Lookout(self) if len(self._hosts) > 1 else None
+        self._lookout = Lookout(self) if len(hosts) > 1 else None
 
     def connect(self) -> DatabaseSession:
         """Connect.
@@ -77,16 +79,12 @@ class Connector:
         Raises:
             psycopg.OperationalError: No host takes writes now.
         """
-        places = {"host": ",".join(self._hosts), "port": ",".join(self._ports)}
-        known = {key: text for key, text in places.items() if text.strip(",")}
-        connection = psycopg.connect(autocommit=True, **{**self._rest, **known})
+        places = self._places
+        connection = psycopg.connect(autocommit=True, **{**self._rest, **_keywords_of(places)})
         connection.prepare_threshold = 0
-        with suppress(ValueError):  # a folder of sockets, or a host that is named otherwise
-            at = list(zip(self._hosts, self._ports, strict=True)).index(
-                (connection.info.host, str(connection.info.port))
-            )
-            for some in (self._hosts, self._ports):
-                some.insert(0, some.pop(at))
+        here = connection.info.host, str(connection.info.port)
+        if here in places:  # else a folder of sockets, or a host that is named otherwise
+            self._places = (here, *(place for place in places if place != here))
         return DatabaseSession(connection)
 
     def waiting(self, session: DatabaseSession) -> AbstractContextManager[None]:
@@ -101,13 +99,14 @@ class Connector:
 
     def primary_beside(self, session: DatabaseSession) -> str:
         """Return another host that takes writes, "" if there is none."""
-        here = self.host_of(session)
-        for host, port in zip(tuple(self._hosts), tuple(self._ports), strict=True):
-            if f"{host}:{port}" == here:
+        for place in self._places:
+            if ":".join(place) == self.host_of(session):
                 continue
-            place = {"host": host, **({"port": port} if port else {})}
-            with suppress(psycopg.Error), psycopg.connect(**{**self._rest, **place}):
-                return f"{host}:{port}"
+            keywords = {**self._rest, **_keywords_of((place,))}
+            with suppress(psycopg.Error), psycopg.connect(**keywords) as other:
+                # Two names may be those of one server.
+                if _started(other) != session.started:
+                    return ":".join(place)
         return ""
 
 
@@ -116,6 +115,7 @@ class DatabaseSession:
 
     def __init__(self, connection: psycopg.Connection[tuple[Any, ...]]) -> None:
         self.connection = connection
+        self.started = _started(connection)
         self._class = ""
         self._warnings: list[str] = []
         connection.add_notice_handler(self._warned)
@@ -170,6 +170,17 @@ class DatabaseSession:
         """Close the connection; idempotent."""
         with suppress(psycopg.Error):
             self.connection.close()
+
+
+def _keywords_of(places: Sequence[tuple[str, str]]) -> dict[str, str]:
+    """Return how libpq is given hosts and ports; what is not said is left to its defaults."""
+    hosts, ports = (",".join(some) for some in zip(*places, strict=True))
+    return {key: text for key, text in (("host", hosts), ("port", ports)) if text.strip(",")}
+
+
+def _started(connection: psycopg.Connection[tuple[Any, ...]]) -> object:
+    """Return when a server was started: no two of a database were in the same microsecond."""
+    return connection.execute("SELECT pg_postmaster_start_time()").fetchone()
 
 
 def is_lost(failure: Exception, session: DatabaseSession | None) -> bool:

@@ -72,7 +72,9 @@ SELECT 1 / count(*) FROM fence
 PUT_BODY: Final = """
 INSERT INTO enact.body SELECT %b, %b, %b + r.part, r.data
 FROM unnest(%b::bytea[]) WITH ORDINALITY AS r(data, part)
+ON CONFLICT DO NOTHING
 """
+"""Names are never used twice, so parts that are there are those of an earlier try."""
 ROWS: Final = """
 SELECT id, kind, batch, key, body, crc FROM enact.record WHERE shard = %b ORDER BY id
 """
@@ -80,10 +82,11 @@ BODIES: Final = "SELECT name, data FROM enact.body WHERE shard = %b ORDER BY nam
 COPIES: Final = """
 SELECT application_name, sync_state, state FROM pg_stat_replication ORDER BY application_name
 """
-SHARDS: Final = "SELECT id, name, epoch, batch, holder FROM enact.shard WHERE cell = %s"
+SHARDS: Final = "SELECT id, name, epoch, batch, holder, beat FROM enact.shard WHERE cell = %s"
 NAME_ME: Final = "SELECT set_config('application_name', %s, false)"
 STANDBYS: Final = """
-SELECT application_name FROM pg_stat_activity WHERE application_name LIKE 'enact-standby/%/%'
+SELECT application_name FROM pg_stat_activity WHERE datname = current_database()
+    AND application_name ~ '^enact-standby/[0-9]+/'
 ORDER BY backend_start
 """
 
