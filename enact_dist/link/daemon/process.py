@@ -39,6 +39,7 @@ def run_shard(settings: DaemonSettings) -> int:
     name = settings.shard.name
     manager = ServiceManager()
     formatter = formatter_of(settings)
+    gc.set_threshold(*GC_THRESHOLDS)  # a large shard is read without full collections, too
     with Log(formatter), StopSignals() as signals:
         try:
             shard = _started(settings, signals.event, manager, formatter)
@@ -115,4 +116,3 @@ def _stay_responsive() -> None:
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     gc.collect()
     gc.freeze()
-    gc.set_threshold(*GC_THRESHOLDS)

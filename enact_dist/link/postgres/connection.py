@@ -26,6 +26,8 @@ from enact_dist.link.postgres.address import without_password
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from enact_dist.link.postgres.address import StoreAddress
+
 CONNECT_S: Final = 2
 """How long one host may take to answer a connection."""
 _KEYWORDS: Final[dict[str, Any]] = {
@@ -146,6 +148,11 @@ class DatabaseSession:
         """Close the connection; idempotent."""
         with suppress(psycopg.Error):
             self.connection.close()
+
+
+def connector_of(address: StoreAddress) -> Connector:
+    """Return what connects to the database of a shard."""
+    return Connector(address.url, f"enact {address.cell} {address.shard} on {myself()}")
 
 
 def is_lost(failure: Exception, session: DatabaseSession | None) -> bool:
