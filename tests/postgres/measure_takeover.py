@@ -10,10 +10,10 @@ import time
 from pathlib import Path
 
 import postgres_nodes
-from replicated_cell import COUNT, STANDS_BY, Counting, ReplicatedCell
+from replicated_cell import COUNT, Counting, ReplicatedCell
 
 from enact_dist import Entity, Lock, Write, connect
-from enact_dist.link.log import READY
+from enact_dist.link.log import READY, STANDS_BY
 
 AT_ONCE = 1000
 SETTLED_S = 20.0

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.errors import EnactError
 from enact_dist.link.daemon.daemon import formatter_of, start_shard, take_shard
 from enact_dist.link.daemon.service_manager import ServiceManager
-from enact_dist.link.log import READY, Log, say
+from enact_dist.link.log import READY, STANDS_BY, Log, say
 from enact_dist.link.signals import StopSignals
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ def _started(
         return start_shard(settings)
     if not settings.standby:
         return take_shard(settings, stopped, lambda: None)
-    text = f"standing by for shard {settings.shard.name} of cell {settings.cell}"
+    text = f"{STANDS_BY} for shard {settings.shard.name} of cell {settings.cell}"
     told = threading.Event()
 
     def waiting() -> None:
