@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from contextlib import AbstractContextManager
 
+    from enact_dist.link.postgres.address import StoreAddress
+
 CONNECT_S: Final = 2
 """How long one host may take to answer a connection."""
 _KEYWORDS: Final[dict[str, Any]] = {
@@ -181,6 +183,11 @@ def _keywords_of(places: Sequence[tuple[str, str]]) -> dict[str, str]:
 def _started(connection: psycopg.Connection[tuple[Any, ...]]) -> object:
     """Return when a server was started: no two of a database were in the same microsecond."""
     return connection.execute("SELECT pg_postmaster_start_time()").fetchone()
+
+
+def connector_of(address: StoreAddress) -> Connector:
+    """Return what connects to the database of a shard."""
+    return Connector(address.url, f"enact {address.cell} {address.shard} on {myself()}")
 
 
 def is_lost(failure: Exception, session: DatabaseSession | None) -> bool:

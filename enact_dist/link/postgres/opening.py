@@ -7,7 +7,8 @@ failover, and no other process writes it.  The lease is renewed while rows are r
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import threading
+from typing import TYPE_CHECKING
 
 from psycopg.types.numeric import Int8
 
@@ -16,27 +17,20 @@ from enact_dist.errors import StoreError
 from enact_dist.link.folder.folder import refuse
 from enact_dist.link.lease import HostLease
 from enact_dist.link.postgres.address import ShardHeldError
+from enact_dist.link.postgres.ahead import RowReader, streamed
 from enact_dist.link.postgres.bodies import ReadBodies
-from enact_dist.link.postgres.connection import CONFIRMED, Connector, myself
+from enact_dist.link.postgres.connection import CONFIRMED, connector_of, myself
 from enact_dist.link.postgres.line import HeldRow, Renewer
 from enact_dist.link.postgres.medium import PostgresMedium, database_errors
-from enact_dist.link.postgres.tables import BODIES, FENCE, ROWS, make_tables, state_of_shard
-from enact_dist.link.store.database import DatabaseRow
-from enact_dist.link.store.recovery import put_together, read_blobs, read_contents
+from enact_dist.link.postgres.tables import BODIES, FENCE, make_tables, state_of_shard
+from enact_dist.link.store.recovery import gather, put_together, read_blobs
 from enact_dist.link.store.store import Store
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from enact_dist.core.protocol.records import Recovered
     from enact_dist.link.postgres.address import FreeShard, StoreAddress
     from enact_dist.link.postgres.connection import DatabaseSession
     from enact_dist.link.store.recovery import Contents
-
-
-def connector_of(address: StoreAddress) -> Connector:
-    """Return what connects to the database of a shard."""
-    return Connector(address.url, f"enact {address.cell} {address.shard} on {myself()}")
 
 
 def look(session: DatabaseSession, address: StoreAddress) -> tuple[int, HolderRow]:
@@ -74,7 +68,7 @@ def open_database(free: FreeShard, *, unix_s: int) -> tuple[Store, Recovered]:
         ShardHeldError: Another process was first, or its holder lives.
         StoreError: The database cannot be used, or what it holds is damaged.
     """
-    address, seen = free
+    address, seen = free.address, free.seen
     name = str(address)
     with database_errors(name):
         session = (connector := connector_of(address)).connect()
@@ -88,7 +82,7 @@ def open_database(free: FreeShard, *, unix_s: int) -> tuple[Store, Recovered]:
             session.close()
             raise
         try:
-            contents = _read(session, shard, name)
+            contents = _read(session, shard, free)
             if contents.batch != batch:
                 refuse(
                     name, f"is damaged: its newest row is of batch {contents.batch}, not {batch}"
@@ -123,26 +117,12 @@ def _fence(
     return shard, epoch, now.batch
 
 
-class _Rows:
-    """Gives rows to `read_contents`, a few at a time."""
-
-    def __init__(self, session: DatabaseSession, shard: int) -> None:
-        self._session, self._shard = session, shard
-
-    def rows(self) -> Iterator[DatabaseRow]:
-        """Yield all rows, oldest identity first."""
-        yield from map(DatabaseRow._make, _streamed(self._session, ROWS, self._shard))
-
-
-def _streamed(session: DatabaseSession, statement: str, shard: int) -> Iterator[tuple[Any, ...]]:
-    with session.connection.cursor(binary=True) as cursor:
-        yield from cursor.stream(statement.encode(), (shard,))
-
-
-def _read(session: DatabaseSession, shard: int, name: str) -> Contents:
-    """Read and check all rows and bodies of a shard."""
-    contents = read_contents(_Rows(session, shard), name)
-    bodies = ReadBodies(name, _streamed(session, BODIES, shard))
+def _read(session: DatabaseSession, shard: int, free: FreeShard) -> Contents:
+    """Read and check all rows and bodies of a shard, but for rows that were read ahead."""
+    name, rows = str(free.address), dict(free.rows)
+    RowReader(session, shard, name, threading.Event()).bring_up(rows)
+    contents = gather((rows[number] for number in sorted(rows)), name)
+    bodies = ReadBodies(name, streamed(session, BODIES, (shard,)))
     read_blobs(contents, bodies, power_cut=False)
     put_together(contents, name)
     return contents

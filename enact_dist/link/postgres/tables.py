@@ -78,6 +78,14 @@ ON CONFLICT DO NOTHING
 ROWS: Final = """
 SELECT id, kind, batch, key, body, crc FROM enact.record WHERE shard = %b ORDER BY id
 """
+NEWER: Final = """
+SELECT id, kind, batch, key, body, crc FROM enact.record WHERE shard = %b AND batch > %b
+"""
+LISTED: Final = "SELECT id, batch, crc FROM enact.record WHERE shard = %b"
+THESE: Final = """
+SELECT id, kind, batch, key, body, crc
+FROM unnest(%b::bigint[]) AS wanted(id) JOIN enact.record USING (id) WHERE shard = %b
+"""
 BODIES: Final = "SELECT name, data FROM enact.body WHERE shard = %b ORDER BY name, part"
 COPIES: Final = """
 SELECT application_name, sync_state, state FROM pg_stat_replication ORDER BY application_name
