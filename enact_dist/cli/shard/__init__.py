@@ -157,4 +157,20 @@ VERBS: Final = (
             flag("--replace", "move the present folder aside, beside it"),
         ),
     ),
+    Verb(
+        "restored",
+        "after the database of a stopped cell went back to an earlier moment: begin new epochs",
+        "store:run_restored",
+        "enact shard restored --cell cell.toml\n"
+        "enact shard restored left right --cell cell.toml --json",
+        (
+            option("shards", "SHARD", "name of a shard (default: all that the database has)",
+                   nargs="*"),
+            flag("--fence", "take shards from daemons that still serve them; those daemons end"),
+            CELL_FILE,
+            JSON,
+        ),
+        columns=("shard", "epoch before", "epoch now", "newest batch", "was held by"),
+        page="surviving",
+    ),
 )  # fmt: skip

@@ -47,6 +47,9 @@ RENEW: Final = "UPDATE enact.shard SET beat = beat + 1 WHERE id = %b AND epoch =
 RESIGN: Final = """
 UPDATE enact.shard SET beat = beat + 1, holder = '' WHERE id = %b AND epoch = %b RETURNING beat
 """
+RAISE: Final = """
+UPDATE enact.shard SET epoch = %b, beat = beat + 1, holder = '' WHERE id = %b RETURNING epoch
+"""
 REACHED: Final = "SELECT epoch, batch FROM enact.shard WHERE id = %b"
 WRITE: Final = """
 WITH fence AS (
@@ -81,6 +84,9 @@ COPIES: Final = """
 SELECT application_name, sync_state, state FROM pg_stat_replication ORDER BY application_name
 """
 SHARDS: Final = "SELECT id, name, epoch, batch, holder FROM enact.shard WHERE cell = %s"
+SHARD_ROWS: Final = """
+SELECT id, name, epoch, batch, beat, holder FROM enact.shard WHERE cell = %b ORDER BY name
+"""
 NAME_ME: Final = "SELECT set_config('application_name', %s, false)"
 STANDBYS: Final = """
 SELECT application_name FROM pg_stat_activity WHERE application_name LIKE 'enact-standby/%/%'
