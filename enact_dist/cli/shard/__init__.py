@@ -24,6 +24,10 @@ CHECK_S: Final = 2.0
 _NAME: Final = option("name", "NAME", "name of the shard in cell.toml")
 _FOLDER: Final = file_of("--folder", "DIR", "folder of the shard, unless it is that of cell.toml")
 
+_DATABASE: Final = option(
+    "--store", "URL", "the database (default: `store` of cell.toml); only this command uses it"
+)
+
 
 def _path(name: str, text: str) -> Option:
     return file_of(name, "DIR", text, dest="path", required=True)
@@ -171,6 +175,35 @@ VERBS: Final = (
             JSON,
         ),
         columns=("shard", "epoch before", "epoch now", "newest batch", "was held by"),
+        page="surviving",
+    ),
+    Verb(
+        "export-store", "copy a stopped shard from the database to a new folder",
+        "store:run_export",
+        "enact shard export-store left data/left --cell cell.toml\n"
+        "enact shard export-store left data/left --store postgresql://enact@db1,db2/cell",
+        (
+            _NAME,
+            file_of("path", "FOLDER", "a folder that does not exist yet"),
+            _DATABASE,
+            CELL_FILE,
+            JSON,
+        ),
+        page="surviving",
+    ),
+    Verb(
+        "import-store",
+        "copy a stopped shard from its folder to a database that has no data of it",
+        "store:run_import",
+        "enact shard import-store left data/left --cell cell.toml\n"
+        "enact shard import-store left data/left --store postgresql://enact@db1,db2/cell",
+        (
+            _NAME,
+            file_of("path", "FOLDER", "the folder of the shard"),
+            _DATABASE,
+            CELL_FILE,
+            JSON,
+        ),
         page="surviving",
     ),
 )  # fmt: skip

@@ -7,7 +7,7 @@ failover, and no other process writes it.  The lease is renewed while rows are r
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from psycopg.types.numeric import Int8
 
@@ -47,10 +47,12 @@ def look(session: DatabaseSession, address: StoreAddress) -> tuple[int, HolderRo
         psycopg.Error: As the database reports it.
     """
     make_tables(session, address.cell, address.shard)
-    return _row(session, address)
+    return row_of_shard(session, address)
 
 
-def _row(session: DatabaseSession, address: StoreAddress, more: str = "") -> tuple[int, HolderRow]:
+def row_of_shard(
+    session: DatabaseSession, address: StoreAddress, more: str = ""
+) -> tuple[int, HolderRow]:
     """Return the id of a shard's row, and the row."""
     statement, values = state_of_shard(address.cell, address.shard)
     found = session.row(statement + more, values)
@@ -74,31 +76,59 @@ def open_database(free: FreeShard, *, unix_s: int) -> tuple[Store, Recovered]:
         ShardHeldError: Another process was first, or its holder lives.
         StoreError: The database cannot be used, or what it holds is damaged.
     """
-    address, seen = free
-    name = str(address)
+    name = str(free.address)
     with database_errors(name):
-        session = (connector := connector_of(address)).connect()
+        held = take_over(free, unix_s=unix_s)
         try:
-            lease = HostLease(address.lease_s)
-            sent_s = lease.now_s()
-            shard, epoch, batch = _fence(session, address, unix_s, seen)
-            lease.confirmed(sent_s)
-            medium = _medium(session, HeldRow(connector, shard, epoch, lease, name))
+            contents = read_rows(held, name)
+            bodies = ReadBodies(name, streamed(held.session, BODIES, held.shard))
+            read_blobs(contents, bodies, power_cut=False)
+            put_together(contents, name)
+            contents.recovered.epoch = held.epoch
+            store = Store(held.medium, contents, wall_ns=unix_s * 1_000_000_000)
         except BaseException:
-            session.close()
-            raise
-        try:
-            contents = _read(session, shard, name)
-            if contents.batch != batch:
-                refuse(
-                    name, f"is damaged: its newest row is of batch {contents.batch}, not {batch}"
-                )
-            contents.recovered.epoch = epoch
-            store = Store(medium, contents, wall_ns=unix_s * 1_000_000_000)
-        except BaseException:
-            medium.close()
+            held.medium.close()
             raise
     return store, contents.recovered
+
+
+class HeldShard(NamedTuple):
+    """A shard that this process has taken over.
+
+    Attributes:
+        medium: Renews the lease; `close` frees the shard.
+        session: The connection of the medium, for reading until its first commit.
+        shard: Its row.
+        epoch: The new epoch.
+        batch: Number of the newest batch.
+    """
+
+    medium: PostgresMedium
+    session: DatabaseSession
+    shard: int
+    epoch: int
+    batch: int
+
+
+def take_over(free: FreeShard, *, unix_s: int) -> HeldShard:
+    """Begin a new epoch of a shard, and renew its lease from now on.
+
+    Raises:
+        ShardHeldError: Another process was first, or its holder lives.
+        psycopg.Error: As the database reports it.
+    """
+    address, seen = free
+    session = (connector := connector_of(address)).connect()
+    try:
+        lease = HostLease(address.lease_s)
+        sent_s = lease.now_s()
+        shard, epoch, batch = _fence(session, address, unix_s, seen)
+        lease.confirmed(sent_s)
+        tenure = HeldRow(connector, shard, epoch, lease, str(address))
+        return HeldShard(_medium(session, tenure), session, shard, epoch, batch)
+    except BaseException:
+        session.close()
+        raise
 
 
 def _medium(session: DatabaseSession, tenure: HeldRow) -> PostgresMedium:
@@ -111,7 +141,7 @@ def _fence(
     """Begin a new epoch; return the shard's row, the epoch, and the number of the newest batch."""
     session.commit_as(CONFIRMED)
     with session.connection.transaction():
-        shard, now = _row(session, address, " FOR UPDATE")
+        shard, now = row_of_shard(session, address, " FOR UPDATE")
         if (now.epoch, now.beat) != (seen.epoch, seen.beat):
             raise ShardHeldError(
                 f"{address} is served by process {now.holder or 'unknown'} in epoch {now.epoch}",
@@ -123,26 +153,31 @@ def _fence(
     return shard, epoch, now.batch
 
 
-class _Rows:
-    """Gives rows to `read_contents`, a few at a time."""
+class StreamedRows:
+    """Gives the rows of a shard, a few at a time."""
 
     def __init__(self, session: DatabaseSession, shard: int) -> None:
         self._session, self._shard = session, shard
 
     def rows(self) -> Iterator[DatabaseRow]:
         """Yield all rows, oldest identity first."""
-        yield from map(DatabaseRow._make, _streamed(self._session, ROWS, self._shard))
+        yield from map(DatabaseRow._make, streamed(self._session, ROWS, self._shard))
 
 
-def _streamed(session: DatabaseSession, statement: str, shard: int) -> Iterator[tuple[Any, ...]]:
+def streamed(session: DatabaseSession, statement: str, shard: int) -> Iterator[tuple[Any, ...]]:
+    """Yield what a statement finds of a shard, a few rows at a time."""
     with session.connection.cursor(binary=True) as cursor:
         yield from cursor.stream(statement.encode(), (shard,))
 
 
-def _read(session: DatabaseSession, shard: int, name: str) -> Contents:
-    """Read and check all rows and bodies of a shard."""
-    contents = read_contents(_Rows(session, shard), name)
-    bodies = ReadBodies(name, _streamed(session, BODIES, shard))
-    read_blobs(contents, bodies, power_cut=False)
-    put_together(contents, name)
+def read_rows(held: HeldShard, name: str) -> Contents:
+    """Read and check all rows of a shard.
+
+    Raises:
+        StoreError: They are damaged.
+        psycopg.Error: As the database reports it.
+    """
+    contents = read_contents(StreamedRows(held.session, held.shard), name)
+    if contents.batch != held.batch:
+        refuse(name, f"is damaged: its newest row is of batch {contents.batch}, not {held.batch}")
     return contents

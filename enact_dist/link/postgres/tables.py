@@ -47,6 +47,7 @@ RENEW: Final = "UPDATE enact.shard SET beat = beat + 1 WHERE id = %b AND epoch =
 RESIGN: Final = """
 UPDATE enact.shard SET beat = beat + 1, holder = '' WHERE id = %b AND epoch = %b RETURNING beat
 """
+FILL: Final = "UPDATE enact.shard SET batch = %b WHERE id = %b RETURNING batch"
 RAISE: Final = """
 UPDATE enact.shard SET epoch = %b, beat = beat + 1, holder = '' WHERE id = %b RETURNING epoch
 """
