@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from contextlib import closing
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from enact_dist.core.failover.lease import HolderRow, Standby
 from enact_dist.errors import StoreError
@@ -23,6 +23,12 @@ if TYPE_CHECKING:
     from collections.abc import Collection
 
     from enact_dist.link.postgres.connection import DatabaseSession
+
+
+_REMEDY: Final = (
+    "stop all daemons of the cell first, since they remember what the restore took back; nothing"
+    " was changed (--fence: take the shards from them, and they end)"
+)
 
 
 class RaisedEpoch(NamedTuple):
@@ -77,17 +83,18 @@ def raise_epochs(
                 path=name,
             )
         if fence:
-            seen = _rows(session, cell, shards, name)
+            seen = rows_of_cell(session, cell, shards, name)
         else:
-            seen = _idle(session, cell, shards, name, lease_s)
+            seen = idle_rows(session, cell, shards, name, lease_s, remedy=_REMEDY)
         session.commit_as(CONFIRMED)
         with session.connection.transaction():
-            found = _rows(session, cell, seen, name, " FOR UPDATE")
+            found = rows_of_cell(session, cell, seen, name, " FOR UPDATE")
             if not fence:
-                _refuse_served(
+                refuse_served(
                     [shard for shard, row in found.items() if row[1] != seen[shard][1]],
                     found,
                     name,
+                    _REMEDY,
                 )
             raised = []
             for shard, (row_id, row) in found.items():
@@ -98,8 +105,14 @@ def raise_epochs(
     return raised
 
 
-def _idle(
-    session: DatabaseSession, cell: str, shards: Collection[str], name: str, lease_s: float
+def idle_rows(
+    session: DatabaseSession,
+    cell: str,
+    shards: Collection[str],
+    name: str,
+    lease_s: float,
+    *,
+    remedy: str,
 ) -> dict[str, tuple[int, HolderRow]]:
     """Look at rows until each is known to be free; return them.
 
@@ -108,20 +121,20 @@ def _idle(
     """
     watches: dict[str, Standby] = {}
     while True:
-        found = _rows(session, cell, shards, name)
+        found = rows_of_cell(session, cell, shards, name)
         now_ns = time.monotonic_ns()
         free = [
             watches.setdefault(shard, Standby(round(lease_s * 1e9))).is_free(row, now_ns)
             for shard, (_, row) in found.items()
         ]
-        _refuse_served([shard for shard in found if watches[shard].alive], found, name)
+        refuse_served([shard for shard in found if watches[shard].alive], found, name, remedy)
         if all(free):
             return found
         time.sleep(LOOK_S)
 
 
-def _refuse_served(
-    alive: Collection[str], found: dict[str, tuple[int, HolderRow]], name: str
+def refuse_served(
+    alive: Collection[str], found: dict[str, tuple[int, HolderRow]], name: str, remedy: str
 ) -> None:
     """Refuse shards whose rows change.
 
@@ -132,15 +145,10 @@ def _refuse_served(
         served = ", ".join(
             f"{shard} by process {found[shard][1].holder or 'unknown'}" for shard in alive
         )
-        raise StoreError(
-            f"{name}: daemons serve {served}: stop all daemons of the cell first, since they"
-            " remember what the restore took back; nothing was changed (--fence: take the shards"
-            " from them, and they end)",
-            path=name,
-        )
+        raise StoreError(f"{name}: daemons serve {served}: {remedy}", path=name)
 
 
-def _rows(
+def rows_of_cell(
     session: DatabaseSession, cell: str, shards: Collection[str], name: str, more: str = ""
 ) -> dict[str, tuple[int, HolderRow]]:
     """Return id and row of each shard.
