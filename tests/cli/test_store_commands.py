@@ -19,12 +19,13 @@ def cell(tmp_path):
     [
         (["backup", "left", "--to", "x"], "pg_dump"),
         (["restore", "left", "--from", "x"], "pg_restore"),
-        (["rebalance"], "rebalance"),
-        (["forget", "pose"], "forget"),
+        (["rebalance", "--store", "left=x"], "all shards are found there"),
+        (["forget", "pose", "--store", "left=x"], "all shards are found there"),
     ],
 )
 def test_commands_for_folders_refuse_a_database(cell, capsys, words, found):
     """They name the database, without its password, and what to do instead."""
+    pytest.importorskip("psycopg")
     assert main(["shard", *words, "--cell", cell]) == 2
     said = capsys.readouterr().err
     assert found in said

@@ -223,7 +223,7 @@ def test_backups_into_one_place_are_told_of_each_other(folder, tmp_path, monkeyp
     copy, right = tmp_path / "copy", {"cell": "line", "shard": "right"}
 
     def backup(rest):
-        monkeypatch.setattr(store_copy, "_sync", lambda _: rest())
+        monkeypatch.setattr(store_copy, "sync_all", lambda _: rest())
         back_up(folder, copy, unix_s=1, **NAMES)
 
     _, kill = in_a_child(backup)
@@ -258,7 +258,7 @@ def test_a_place_that_is_taken_meanwhile_is_there_already(folder, tmp_path, monk
         (tmp_path / "copy").mkdir()
         (tmp_path / "copy" / "notes.txt").touch()
 
-    monkeypatch.setattr(store_copy, "_sync", taken)
+    monkeypatch.setattr(store_copy, "sync_all", taken)
     with pytest.raises(StoreError, match="copy exists already; name a new folder"):
         back_up(folder, tmp_path / "copy", unix_s=1, **NAMES)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["copy", "left"]
@@ -285,7 +285,7 @@ def test_a_start_lets_go_of_what_a_killed_backup_held(folder, tmp_path, monkeypa
     links = folder / HELD_FOLDER
 
     def backup(rest):
-        monkeypatch.setattr(store_copy, "_sync", lambda _: rest())
+        monkeypatch.setattr(store_copy, "sync_all", lambda _: rest())
         back_up(folder, tmp_path / "copy", unix_s=1, **NAMES)
 
     pid, kill = in_a_child(backup)

@@ -24,6 +24,10 @@ CHECK_S: Final = 2.0
 _NAME: Final = option("name", "NAME", "name of the shard in cell.toml")
 _FOLDER: Final = file_of("--folder", "DIR", "folder of the shard, unless it is that of cell.toml")
 
+_DATABASE: Final = option(
+    "--store", "URL", "the database (default: `store` of cell.toml); only this command uses it"
+)
+
 
 def _path(name: str, text: str) -> Option:
     return file_of(name, "DIR", text, dest="path", required=True)
@@ -156,5 +160,50 @@ VERBS: Final = (
             JSON,
             flag("--replace", "move the present folder aside, beside it"),
         ),
+    ),
+    Verb(
+        "restored",
+        "after the database of a stopped cell went back to an earlier moment: begin new epochs",
+        "store:run_restored",
+        "enact shard restored --cell cell.toml\n"
+        "enact shard restored left right --cell cell.toml --json",
+        (
+            option("shards", "SHARD", "name of a shard (default: all that the database has)",
+                   nargs="*"),
+            flag("--fence", "take shards from daemons that still serve them; those daemons end"),
+            CELL_FILE,
+            JSON,
+        ),
+        columns=("shard", "epoch before", "epoch now", "newest batch", "was held by"),
+        page="surviving",
+    ),
+    Verb(
+        "export-store", "copy a stopped shard from the database to a new folder",
+        "store:run_export",
+        "enact shard export-store left data/left --cell cell.toml\n"
+        "enact shard export-store left data/left --store postgresql://enact@db1,db2/cell",
+        (
+            _NAME,
+            file_of("path", "FOLDER", "a folder that does not exist yet"),
+            _DATABASE,
+            CELL_FILE,
+            JSON,
+        ),
+        page="surviving",
+    ),
+    Verb(
+        "import-store",
+        "copy a stopped shard from its folder to a database that has no data of it",
+        "store:run_import",
+        "enact shard import-store left data/left --cell cell.toml\n"
+        "enact shard import-store left data/left --store postgresql://enact@db1,db2/cell",
+        (
+            _NAME,
+            file_of("path", "FOLDER", "the folder of the shard"),
+            _DATABASE,
+            CELL_FILE,
+            JSON,
+        ),
+        page="surviving",
     ),
 )  # fmt: skip

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from enact_dist.cli.arguments import pairs
-from enact_dist.cli.shard.shard import refuse_database
+from enact_dist.cli.shard.shard import whole_store
 from enact_dist.cli.target import cell_config
 from enact_dist.cli.text.output import ProgressLine, print_json, print_table, shown_bytes
 from enact_dist.cli.verbs import DONE, FAILED
@@ -22,10 +22,11 @@ from enact_dist.errors import ConfigError
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Iterable
+    from collections.abc import Collection, Iterable
 
     from enact_dist.config.types import CellConfig
     from enact_dist.link.offline.forgetting import Purged
+    from enact_dist.link.postgres.address import StoreAddress
 
 
 def run_forget(options: argparse.Namespace) -> int:
@@ -33,25 +34,26 @@ def run_forget(options: argparse.Namespace) -> int:
     from enact_dist.link.offline.forgetting import forget, look
 
     config = cell_config(options)
-    refuse_database(
-        config,
-        "enact shard forget deletes aspects from folders",
-        "there is no such command for it yet",
-    )
-    folders, elsewhere = _folders(config, pairs(options.store, "--store"), options)
+    stores = pairs(options.store, "--store")
+    database = whole_store(config, stores) if config.store else None
+    folders, elsewhere = ({}, []) if database else _folders(config, stores, options)
     if not options.aspects and not options.unused:
         raise ConfigError("name the aspects to forget, or --unused for all without data")
-    if options.unused and len(folders) < sum(s.folder is not None for s in config.shards):
+    with_data = len(config.shards if database else [s for s in config.shards if s.folder])
+    some = len(options.shard or config.shards) if database else len(folders)
+    if options.unused and some < with_data:
         raise ConfigError(
             f"--unused needs the data of all shards, but {'; '.join(elsewhere) or 'not all'}:"
             " name the folders of the others with --store"
         )
     unused = config.worlds if options.unused else None
     told = _Told(as_json=options.json, goes="goes" if options.yes else "would go")
-    if not folders:
+    if not folders and database is None:
         raise ConfigError(f"no shard of {config.path} has its data here: {'; '.join(elsewhere)}")
     try:
-        if options.yes:
+        if database is not None:
+            found = _in_database(database, options, unused, told)
+        elif options.yes:
             found = forget(
                 folders,
                 options.aspects,
@@ -75,6 +77,26 @@ def run_forget(options: argparse.Namespace) -> int:
     words = _command(named, options.shard)
     print(f"enact: nothing was changed; to let it go: {words}", file=sys.stderr)
     return FAILED
+
+
+def _in_database(
+    database: StoreAddress,
+    options: argparse.Namespace,
+    unused: Collection[str] | None,
+    told: _Told,
+) -> Purged:
+    """Let aspects go in the database of a cell, in one transaction."""
+    from enact_dist.link.offline.database import forget_database
+
+    return forget_database(
+        database,
+        options.aspects,
+        only=options.shard,
+        now_ns=time.time_ns(),
+        unused=unused,
+        dry_run=not options.yes,
+        progress=told,
+    )
 
 
 def _command(aspects: Iterable[str], shards: Iterable[str] = ()) -> str:

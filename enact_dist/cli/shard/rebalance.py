@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.cli.arguments import pairs
-from enact_dist.cli.shard.shard import refuse_database
+from enact_dist.cli.shard.shard import whole_store
 from enact_dist.cli.target import cell_config
 from enact_dist.cli.text.output import ProgressLine, print_json, print_table, shown_bytes
 from enact_dist.cli.verbs import DONE
@@ -33,22 +33,21 @@ def run_rebalance(options: argparse.Namespace) -> int:
     from enact_dist.link.offline.rebalance import look, rebalance
 
     config = cell_config(options)
-    refuse_database(
-        config,
-        "enact shard rebalance moves data between folders",
-        "there is no such command for it yet",
-    )
     stores = pairs(options.store, "--store")
-    folders = _folders(config, stores, options.new)
     placement = config.placement_map()
-    if options.dry_run:
-        found = look(folders, placement)
-    else:
-        progress = _Shown()
-        try:
-            found = rebalance(folders, placement, unix_s=int(time.time()), progress=progress)
-        finally:
-            progress.line.end()
+    progress = _Shown()
+    folders: dict[str, Path] = {}
+    try:
+        if config.store:
+            found = _in_database(config, stores, options, progress)
+        else:
+            folders = _folders(config, stores, options.new)
+            if options.dry_run:
+                found = look(folders, placement)
+            else:
+                found = rebalance(folders, placement, unix_s=int(time.time()), progress=progress)
+    finally:
+        progress.line.end()
     if options.json:
         moves = [move._asdict() for move in found.moves]
         print_json({"done": not options.dry_run, "resumed": found.resumed, "moves": moves})
@@ -56,6 +55,25 @@ def run_rebalance(options: argparse.Namespace) -> int:
         _print(found, dry_run=options.dry_run)
     _name_others(config, folders)
     return DONE
+
+
+def _in_database(
+    config: CellConfig, stores: dict[str, str], options: argparse.Namespace, progress: _Shown
+) -> Rebalance:
+    """Move what has to be moved in the database of a cell, in one transaction."""
+    address = whole_store(config, stores)
+    from enact_dist.link.offline.database import rebalance_database
+
+    for name in options.new:
+        config.shard(name)
+    return rebalance_database(
+        address,
+        config.placement_map(),
+        new=options.new,
+        unix_s=int(time.time()),
+        dry_run=options.dry_run,
+        progress=progress,
+    )
 
 
 def _folders(config: CellConfig, stores: dict[str, str], new: list[str]) -> dict[str, Path]:

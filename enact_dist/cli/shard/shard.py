@@ -18,7 +18,7 @@ from enact_dist.world.trees import shown_s
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Sequence
+    from collections.abc import Collection, Sequence
 
     from enact_dist.config.types import CellConfig
     from enact_dist.link.daemon.health import ShardHealth
@@ -93,6 +93,24 @@ def store_of(config: CellConfig, shard: str) -> StoreAddress | None:
     from enact_dist.link.postgres.address import StoreAddress
 
     return StoreAddress(config.store, config.name, shard, config.lease_s) if config.store else None
+
+
+def whole_store(config: CellConfig, folders: Collection[str]) -> StoreAddress:
+    """Return the database of a cell, for a command that works on all shards in it.
+
+    Raises:
+        ConfigError: Folders are named.
+        StoreError: psycopg is not installed.
+    """
+    from enact_dist.link.postgres.address import StoreAddress, require_driver
+
+    if folders:
+        raise ConfigError(
+            f"--store names folders ({', '.join(folders)}), and this cell keeps its data in"
+            f" {without_password(config.store)}: leave it out, all shards are found there"
+        )
+    require_driver(config.store)
+    return StoreAddress(config.store, config.name, "", config.lease_s)
 
 
 def refuse_database(config: CellConfig, does: str, remedy: str) -> None:

@@ -10,6 +10,7 @@ Errors of the system pass through as `OSError`.
 from __future__ import annotations
 
 import os
+import re
 import zlib
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
 
 _SUFFIX: Final = ".blob"
 _DRAFT_SUFFIX: Final = ".tmp"
+_NAME: Final = re.compile(r"[0-9a-f]+-[0-9a-f]+(\.blob)?")
+"""Names made here, and those that came from a database with the bodies."""
 _PART_BYTES: Final = 1 << 20
 """Bodies are checksummed and written in parts of this size: the second touch hits the cache."""
 
@@ -152,8 +155,13 @@ class BlobFolder:
         return [
             path.name
             for path in self.folder.iterdir()
-            if path.name.endswith((_SUFFIX, _DRAFT_SUFFIX))
+            if path.name.endswith((_SUFFIX, _DRAFT_SUFFIX)) or is_name(path.name)
         ]
+
+
+def is_name(name: str) -> bool:
+    """Whether a body of a store may have this name, in a folder or in a database."""
+    return _NAME.fullmatch(name) is not None
 
 
 def _write_all(descriptor: int, body: memoryview) -> int:

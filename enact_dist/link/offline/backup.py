@@ -127,8 +127,8 @@ def back_up(folder: Path, into: Path, *, cell: str, shard: str, unix_s: int) -> 
             facts[MODES] = _modes(folder, held, files)
             replace_file(partial / BACKUP_FILE, sealed(facts, files), mode=FILE_MODE)
             read_backup(partial)
-            _sync(partial)
-            if not _renamed(partial, into):
+            sync_all(partial)
+            if not renamed(partial, into):
                 raise _is_there(into)
     except OSError as failure:
         raise _backup_error(folder, into, failure) from failure
@@ -153,7 +153,7 @@ def _is_there(into: Path) -> StoreError:
     return StoreError(f"{into} exists already; name a new folder", path=str(into))
 
 
-def _renamed(partial: Path, path: Path) -> bool:
+def renamed(partial: Path, path: Path) -> bool:
     """Rename a folder, replacing an empty one; return False if the target has data."""
     try:
         partial.rename(path)
@@ -190,7 +190,7 @@ def _copied(folder: Path, held: Path, partial: Path) -> Recovered:
             blobs = BlobFolder(partial / BLOB_FOLDER, epoch=0)
             read_blobs(contents, blobs, power_cut=False)
             put_together(contents, partial / DATABASE_FILE)
-            _check_bodies(contents.recovered)
+            check_bodies(contents.recovered)
         return contents.recovered
     raise StoreError(
         f"{folder} changed too fast for a consistent copy in {TRIES_MAX} tries; back it"
@@ -227,7 +227,7 @@ def _header(log: Path) -> bytes:
         return b""
 
 
-def _check_bodies(stored: Recovered) -> None:
+def check_bodies(stored: Recovered) -> None:
     """Read all bytes that nothing has checked yet.
 
     Raises:
@@ -247,7 +247,8 @@ def _description(stored: Recovered, *, cell: str, shard: str, unix_s: int) -> Ba
     return Backup(cell, shard, unix_s, stored.epoch, entities, len(states), size)
 
 
-def _sync(folder: Path) -> None:
+def sync_all(folder: Path) -> None:
+    """Force all files of a shard's folder to the disk, with their names."""
     for path in folder.rglob("*"):
         if path.is_file():
             with path.open("rb") as file:
@@ -349,7 +350,7 @@ def _put(
     """Build a folder in `partial` and move it into place; return the path of the previous one."""
     if not folder.exists() or not any(folder.iterdir()):
         _build(source, partial, contents, unix_s=unix_s, epoch=_epoch_before(folder))
-        if not _renamed(partial, folder):  # another start has made one
+        if not renamed(partial, folder):  # another start has made one
             raise _has_data(folder)
         return None
     if not replace:
@@ -383,7 +384,7 @@ def _build(source: Path, partial: Path, contents: Manifest, *, unix_s: int, epoc
     if files is not None:
         check_files(partial, files)
     with read_store(partial) as stored:
-        _check_bodies(stored)
+        check_bodies(stored)
         found = _description(stored, cell=backup.cell, shard=backup.shard, unix_s=backup.unix_s)
     if found != dataclasses.replace(backup, digests=True):
         raise StoreError(
@@ -395,7 +396,7 @@ def _build(source: Path, partial: Path, contents: Manifest, *, unix_s: int, epoc
     with closing(store):
         store.raise_epoch(epoch)
     set_modes(partial, modes or modes_of(source, (BLOB_FOLDER, *names)))
-    _sync(partial)
+    sync_all(partial)
 
 
 def _epoch_before(folder: Path) -> int:

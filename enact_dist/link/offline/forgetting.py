@@ -78,9 +78,9 @@ def look(
         MisuseError: As `forget`.
     """
     with opened(folders) as (_, stored):
-        found, _ = _plan(folders, stored, aspects, now_ns=0, unused=unused)
+        found, _ = planned_purge(_begun(folders), stored, aspects, now_ns=0, unused=unused)
     (progress or SILENT).found(found)
-    _refuse_unknown(found)
+    refuse_unknown(found)
     return found
 
 
@@ -109,9 +109,9 @@ def forget(
     """
     progress = progress or SILENT
     with opened(folders, progress.act, unix_s=now_ns // 1_000_000_000) as (stores, stored):
-        found, plan = _plan(folders, stored, aspects, now_ns=now_ns, unused=unused)
+        found, plan = planned_purge(_begun(folders), stored, aspects, now_ns=now_ns, unused=unused)
         progress.found(found)
-        _refuse_unknown(found)
+        refuse_unknown(found)
         if plan.records:
             begun = _begun(folders)
             at_ns = {name: begun.get(name, at_ns) for name, at_ns in plan.at_ns.items()}
@@ -128,8 +128,8 @@ def forget(
     return found
 
 
-def _plan(
-    folders: Mapping[str, Path],
+def planned_purge(
+    begun: Mapping[str, int],
     stored: Mapping[str, Recovered],
     aspects: Iterable[str],
     *,
@@ -138,10 +138,16 @@ def _plan(
 ) -> tuple[Purged, PurgePlan]:
     """Return the plan; aspects of an interrupted run are purged as well.
 
+    Args:
+        begun: These, each with the timestamp from which on to purge.
+        stored: What each shard has stored.
+        aspects: Names of the aspects.
+        now_ns: The wall clock, nanoseconds since 1970.
+        unused: As for `forget`.
+
     Raises:
         StoreError: There is an obstacle.
     """
-    begun = _begun(folders)
     worlds: tuple[str, ...] = ()
     if unused is not None:
         aspects = dict.fromkeys((*aspects, *unused_aspects(stored)))
@@ -162,7 +168,12 @@ def _begun(folders: Mapping[str, Path]) -> dict[str, int]:
     return {name: at_ns for each in marks.values() for name, at_ns in each.aspects.items()}
 
 
-def _refuse_unknown(found: Purged) -> None:
+def refuse_unknown(found: Purged) -> None:
+    """Refuse aspects that no shard ever knew.
+
+    Raises:
+        MisuseError: There are some.
+    """
     unknown = [name for name in found.aspects if name not in found.known]
     if unknown:
         raise MisuseError(

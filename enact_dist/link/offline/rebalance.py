@@ -27,7 +27,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
     from pathlib import Path
 
+    from enact_dist.core.offline.moving import MovePlan
     from enact_dist.core.protocol.messages import PlacementMap
+    from enact_dist.core.protocol.records import Recovered
     from enact_dist.link.store.store import Store
 
 BATCH_BYTES: Final = 32 << 20
@@ -103,23 +105,41 @@ def rebalance(
         refuse_obstacles("nothing was moved", plan.obstacles)
         if plan.moves or plan.first or resumed:
             mark(folders, progress.act)
-        if plan.moves or plan.first:
-            epoch = max(found.epoch for found in stored.values())
-            for name, store in stores.items():
-                progress.act(f"raise the epoch of {name}")
-                store.raise_epoch(epoch)
-            for name, records in plan.first.items():
-                progress.act(f"tell {name}")
-                write(stores[name], records)
-            _move(shards, plan.moves, stores, progress)
+        carry_out(shards, plan, stores, stored, progress)
         wait_s = 0.0
         if plan.moves or resumed:
-            ttl_ns = max((s.ttl_ns for found in stored.values() for s in found.sessions), default=0)
-            wait_s = max(0.0, locked_s + ttl_ns / 1e9 - time.monotonic())
-            progress.waits(wait_s)
-            time.sleep(wait_s)
+            wait_s = wait_for_leases(stored, locked_s, progress)
         unmark(folders, progress.act)
     return Rebalance(plan.moves, resumed, wait_s)
+
+
+def carry_out(
+    shards: Shards,
+    plan: MovePlan,
+    stores: Mapping[str, Store],
+    stored: Mapping[str, Recovered],
+    progress: Progress,
+) -> None:
+    """Raise all epochs, tell each shard what all must know, and move the entities."""
+    if not plan.moves and not plan.first:
+        return
+    epoch = max(found.epoch for found in stored.values())
+    for name, store in stores.items():
+        progress.act(f"raise the epoch of {name}")
+        store.raise_epoch(epoch)
+    for name, records in plan.first.items():
+        progress.act(f"tell {name}")
+        write(stores[name], records)
+    _move(shards, plan.moves, stores, progress)
+
+
+def wait_for_leases(stored: Mapping[str, Recovered], locked_s: float, progress: Progress) -> float:
+    """Wait until no client can believe in a lock from before `locked_s`; return how long."""
+    ttl_ns = max((s.ttl_ns for found in stored.values() for s in found.sessions), default=0)
+    wait_s = max(0.0, locked_s + ttl_ns / 1e9 - time.monotonic())
+    progress.waits(wait_s)
+    time.sleep(wait_s)
+    return wait_s
 
 
 def _move(

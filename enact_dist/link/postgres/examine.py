@@ -119,9 +119,9 @@ def _fill(found: DatabaseReport, session: DatabaseSession, cell: str) -> None:
         _, shard, who = text[0].split("/", 2)
         standbys[int(shard)] = (*standbys.get(int(shard), ()), who)
     before = {row[0]: row for row in session.connection.execute(SHARDS, (cell,))}
-    if any(row[4] for row in before.values()):
+    if any(row[-1] for row in before.values()):
         time.sleep(BEAT_S)
     for row in session.connection.execute(SHARDS, (cell,)):
-        row_id, name, epoch, batch, holder, _ = row
+        row_id, name, epoch, batch, _, holder = row
         alive = bool(holder) and row != before.get(row_id)
         found.shards[name] = ShardRow(holder, epoch, batch, standbys.get(row_id, ()), alive)

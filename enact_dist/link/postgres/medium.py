@@ -73,25 +73,13 @@ class PostgresMedium:
         """
         self._failed = True
         tenure = self._tenure
-        values = (
-            Int8(batch),
-            Int8(tenure.shard),
-            Int8(tenure.epoch),
-            Int8(batch - 1),
-            [Int8(row_id) for row_id in gone],
-            [blob.name for blob in unnamed],
-            [Int8(row.id) for row in rows],
-            [Int8(row.kind) for row in rows],
-            [Int8(batch)] * len(rows),
-            [row.key for row in rows],
-            [row.body for row in rows],
-            [Int8(row.crc) for row in rows],
-        )
-        new = self.bodies.take()
+        gone, unnamed, new = list(gone), list(unnamed), self.bodies.take()
 
         def act(session: DatabaseSession) -> None:
             session.commit_as(CONFIRMED if forced else RECEIVED)
-            self._send(session, new, values)
+            send_batch(
+                session.connection, tenure.shard, tenure.epoch, batch, rows, gone, unnamed, new
+            )
 
         def done(session: DatabaseSession) -> bool:
             became = after_break(self.line.reached(session), epoch=tenure.epoch, batch=batch)
@@ -101,22 +89,6 @@ class PostgresMedium:
 
         self.line.again(act, done)
         self._failed = False
-
-    def _send(
-        self, session: DatabaseSession, new: Sequence[NewBody], values: tuple[Any, ...]
-    ) -> None:
-        connection = session.connection
-        if not new:
-            connection.execute(WRITE, values)
-            return
-        with connection.pipeline(), connection.transaction():
-            for name, parts in new:
-                for first in range(0, len(parts), _PARTS_AT_ONCE):
-                    some = parts[first : first + _PARTS_AT_ONCE]
-                    connection.execute(
-                        PUT_BODY, (Int8(self._tenure.shard), name, Int8(first), some)
-                    )
-            connection.execute(WRITE, values)
 
     def rest(self) -> None:
         """Do nothing: the database cleans up by itself."""
@@ -140,6 +112,47 @@ class PostgresMedium:
     def errors(self) -> AbstractContextManager[None]:
         """Return `database_errors` of this shard."""
         return database_errors(self.name)
+
+
+def send_batch(
+    connection: psycopg.Connection[tuple[Any, ...]],
+    shard: int,
+    epoch: int,
+    batch: int,
+    rows: Sequence[DatabaseRow],
+    gone: Iterable[int],
+    unnamed: Iterable[Blob],
+    new: Sequence[NewBody],
+) -> None:
+    """Write a batch of a shard, with its bodies in one transaction.
+
+    Raises:
+        psycopg.Error: As the database reports it; without its row of the fence, nothing is written
+            and this is an `errors.DivisionByZero`.
+    """
+    values = (
+        Int8(batch),
+        Int8(shard),
+        Int8(epoch),
+        Int8(batch - 1),
+        [Int8(row_id) for row_id in gone],
+        [blob.name for blob in unnamed],
+        [Int8(row.id) for row in rows],
+        [Int8(row.kind) for row in rows],
+        [Int8(batch)] * len(rows),
+        [row.key for row in rows],
+        [row.body for row in rows],
+        [Int8(row.crc) for row in rows],
+    )
+    if not new:
+        connection.execute(WRITE, values)
+        return
+    with connection.pipeline(), connection.transaction():
+        for name, parts in new:
+            for first in range(0, len(parts), _PARTS_AT_ONCE):
+                some = parts[first : first + _PARTS_AT_ONCE]
+                connection.execute(PUT_BODY, (Int8(shard), name, Int8(first), some))
+        connection.execute(WRITE, values)
 
 
 @contextmanager

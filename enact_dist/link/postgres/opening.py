@@ -8,7 +8,7 @@ failover, and no other process writes it.  The lease is renewed while rows are r
 from __future__ import annotations
 
 import threading
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from psycopg.types.numeric import Int8
 
@@ -22,15 +22,18 @@ from enact_dist.link.postgres.bodies import ReadBodies
 from enact_dist.link.postgres.connection import CONFIRMED, connector_of, myself
 from enact_dist.link.postgres.line import HeldRow, Renewer
 from enact_dist.link.postgres.medium import PostgresMedium, database_errors
-from enact_dist.link.postgres.tables import BODIES, FENCE, make_tables, state_of_shard
+from enact_dist.link.postgres.tables import BODIES, FENCE, ROWS, make_tables, state_of_shard
+from enact_dist.link.store.database import DatabaseRow
 from enact_dist.link.store.recovery import gather, put_together, read_blobs
 from enact_dist.link.store.store import Store
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
     from enact_dist.core.protocol.records import Recovered
     from enact_dist.link.postgres.address import FreeShard, StoreAddress
     from enact_dist.link.postgres.connection import DatabaseSession
-    from enact_dist.link.store.recovery import Contents
+    from enact_dist.link.store.recovery import CheckedRow, Contents
 
 
 def look(session: DatabaseSession, address: StoreAddress) -> tuple[int, HolderRow]:
@@ -41,10 +44,12 @@ def look(session: DatabaseSession, address: StoreAddress) -> tuple[int, HolderRo
         psycopg.Error: As the database reports it.
     """
     make_tables(session, address.cell, address.shard)
-    return _row(session, address)
+    return row_of_shard(session, address)
 
 
-def _row(session: DatabaseSession, address: StoreAddress, more: str = "") -> tuple[int, HolderRow]:
+def row_of_shard(
+    session: DatabaseSession, address: StoreAddress, more: str = ""
+) -> tuple[int, HolderRow]:
     """Return the id of a shard's row, and the row."""
     statement, values = state_of_shard(address.cell, address.shard)
     found = session.row(statement + more, values)
@@ -68,31 +73,59 @@ def open_database(free: FreeShard, *, unix_s: int) -> tuple[Store, Recovered]:
         ShardHeldError: Another process was first, or its holder lives.
         StoreError: The database cannot be used, or what it holds is damaged.
     """
-    address, seen = free.address, free.seen
-    name = str(address)
+    name = str(free.address)
     with database_errors(name):
-        session = (connector := connector_of(address)).connect()
+        held = take_over(free, unix_s=unix_s)
         try:
-            lease = HostLease(address.lease_s)
-            sent_s = lease.now_s()
-            shard, epoch, batch = _fence(session, address, unix_s, seen)
-            lease.confirmed(sent_s)
-            medium = _medium(session, HeldRow(connector, shard, epoch, lease, name))
+            contents = read_rows(held, name, free.rows)
+            bodies = ReadBodies(name, streamed(held.session, BODIES, (held.shard,)))
+            read_blobs(contents, bodies, power_cut=False)
+            put_together(contents, name)
+            contents.recovered.epoch = held.epoch
+            store = Store(held.medium, contents, wall_ns=unix_s * 1_000_000_000)
         except BaseException:
-            session.close()
-            raise
-        try:
-            contents = _read(session, shard, free)
-            if contents.batch != batch:
-                refuse(
-                    name, f"is damaged: its newest row is of batch {contents.batch}, not {batch}"
-                )
-            contents.recovered.epoch = epoch
-            store = Store(medium, contents, wall_ns=unix_s * 1_000_000_000)
-        except BaseException:
-            medium.close()
+            held.medium.close()
             raise
     return store, contents.recovered
+
+
+class HeldShard(NamedTuple):
+    """A shard that this process has taken over.
+
+    Attributes:
+        medium: Renews the lease; `close` frees the shard.
+        session: The connection of the medium, for reading until its first commit.
+        shard: Its row.
+        epoch: The new epoch.
+        batch: Number of the newest batch.
+    """
+
+    medium: PostgresMedium
+    session: DatabaseSession
+    shard: int
+    epoch: int
+    batch: int
+
+
+def take_over(free: FreeShard, *, unix_s: int) -> HeldShard:
+    """Begin a new epoch of a shard, and renew its lease from now on.
+
+    Raises:
+        ShardHeldError: Another process was first, or its holder lives.
+        psycopg.Error: As the database reports it.
+    """
+    address, seen = free.address, free.seen
+    session = (connector := connector_of(address)).connect()
+    try:
+        lease = HostLease(address.lease_s)
+        sent_s = lease.now_s()
+        shard, epoch, batch = _fence(session, address, unix_s, seen)
+        lease.confirmed(sent_s)
+        tenure = HeldRow(connector, shard, epoch, lease, str(address))
+        return HeldShard(_medium(session, tenure), session, shard, epoch, batch)
+    except BaseException:
+        session.close()
+        raise
 
 
 def _medium(session: DatabaseSession, tenure: HeldRow) -> PostgresMedium:
@@ -105,7 +138,7 @@ def _fence(
     """Begin a new epoch; return the shard's row, the epoch, and the number of the newest batch."""
     session.commit_as(CONFIRMED)
     with session.connection.transaction():
-        shard, now = _row(session, address, " FOR UPDATE")
+        shard, now = row_of_shard(session, address, " FOR UPDATE")
         if (now.epoch, now.beat) != (seen.epoch, seen.beat):
             raise ShardHeldError(
                 f"{address} is served by process {now.holder or 'unknown'} in epoch {now.epoch}",
@@ -117,12 +150,29 @@ def _fence(
     return shard, epoch, now.batch
 
 
-def _read(session: DatabaseSession, shard: int, free: FreeShard) -> Contents:
-    """Read and check all rows and bodies of a shard, but for rows that were read ahead."""
-    name, rows = str(free.address), dict(free.rows)
-    RowReader(session, shard, name, threading.Event()).bring_up(rows)
+class StreamedRows:
+    """Gives the rows of a shard, a few at a time."""
+
+    def __init__(self, session: DatabaseSession, shard: int) -> None:
+        self._session, self._shard = session, shard
+
+    def rows(self) -> Iterator[DatabaseRow]:
+        """Yield all rows, oldest identity first."""
+        yield from map(DatabaseRow._make, streamed(self._session, ROWS, (self._shard,)))
+
+
+def read_rows(
+    held: HeldShard, name: str, ahead: Mapping[int, CheckedRow] | None = None
+) -> Contents:
+    """Read and check all rows of a shard, but for those that were read ahead.
+
+    Raises:
+        StoreError: They are damaged.
+        psycopg.Error: As the database reports it.
+    """
+    rows = dict(ahead or {})
+    RowReader(held.session, held.shard, name, threading.Event()).bring_up(rows)
     contents = gather((rows[number] for number in sorted(rows)), name)
-    bodies = ReadBodies(name, streamed(session, BODIES, (shard,)))
-    read_blobs(contents, bodies, power_cut=False)
-    put_together(contents, name)
+    if contents.batch != held.batch:
+        refuse(name, f"is damaged: its newest row is of batch {contents.batch}, not {held.batch}")
     return contents

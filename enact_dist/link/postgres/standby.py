@@ -75,8 +75,8 @@ def wait_free(
                 found = f"{address} is served by process {seen.holder}"
                 if watch.alive and not patient:
                     raise ShardHeldError(
-                        f"{found}: stop it first, or stand by with `enact shard run"
-                        f" {address.shard} --standby`",
+                        f"{found}: stop it first (a daemon can stand by for it: `enact shard run"
+                        f" {address.shard} --standby`)",
                         path=str(address),
                     )
             except LOST as failure:

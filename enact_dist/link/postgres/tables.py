@@ -47,6 +47,10 @@ RENEW: Final = "UPDATE enact.shard SET beat = beat + 1 WHERE id = %b AND epoch =
 RESIGN: Final = """
 UPDATE enact.shard SET beat = beat + 1, holder = '' WHERE id = %b AND epoch = %b RETURNING beat
 """
+FILL: Final = "UPDATE enact.shard SET batch = %b WHERE id = %b RETURNING batch"
+RAISE: Final = """
+UPDATE enact.shard SET epoch = %b, beat = beat + 1, holder = '' WHERE id = %b RETURNING epoch
+"""
 REACHED: Final = "SELECT epoch, batch FROM enact.shard WHERE id = %b"
 WRITE: Final = """
 WITH fence AS (
@@ -90,7 +94,9 @@ BODIES: Final = "SELECT name, data FROM enact.body WHERE shard = %b ORDER BY nam
 COPIES: Final = """
 SELECT application_name, sync_state, state FROM pg_stat_replication ORDER BY application_name
 """
-SHARDS: Final = "SELECT id, name, epoch, batch, holder, beat FROM enact.shard WHERE cell = %s"
+SHARDS: Final = """
+SELECT id, name, epoch, batch, beat, holder FROM enact.shard WHERE cell = %b ORDER BY name
+"""
 NAME_ME: Final = "SELECT set_config('application_name', %s, false)"
 STANDBYS: Final = """
 SELECT application_name FROM pg_stat_activity WHERE datname = current_database()
