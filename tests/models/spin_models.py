@@ -345,6 +345,7 @@ def _standing_locks() -> list[Variant]:
 def _takeover() -> list[Variant]:
     model = "takeover"
     database, locks = ("CLIENTS=0", "BEATS=2"), ("BATCHES=0", "BEATS=2", "LATE=0")
+    twice = ("CLIENTS=0", "EPOCHS=3", "BEATS=1", "LATE=0")
     all_well = (*database, "FAULTS=2", "EPOCHS=4")
     mutants = [
         ("NO_FENCE", database, 11, "a batch is written whoever has the shard"),
@@ -380,7 +381,8 @@ def _takeover() -> list[Variant]:
     ]
     return [
         Variant(model, "2 daemons, 1 batch, 1 takeover", HOLDS, database),
-        Variant(model, "the same with 2 clients, any number of locks, no batch", HOLDS, locks),
+        Variant(model, "the same, 2 takeovers, fewer renewals", HOLDS, twice),
+        Variant(model, "2 clients, any number of locks, no batch", HOLDS, locks),
         Variant(model, "2 clients and 1 batch, fewer renewals", HOLDS, ("BEATS=1", "LATE=0")),
         Variant(model, "2 faults, then the shard is served", HOLDS, all_well),
         *(

@@ -183,9 +183,8 @@ inline looks(d) {
   mode[d] = LOOKS; its_epoch[d] = 0; number[d] = 0; since[d] = 0;
   unsure[d] = false; saw_free[d] = false; grace[d] = false; holder[d] = NOBODY;
 #ifdef CHECKS_FIRST
-  checked[d] = false;
+  checked[d] = false
 #endif
-  skip
 }
 
 inline send(d, k) { kind[d] = k; stage[d] = SENT; age[d] = 0 }
@@ -350,7 +349,7 @@ proctype Primary(byte d) {
        forget() }
   /* faults of one daemon's: cancelled, broken, ended in good order, killed */
   :: atomic { fault && stage[d] == EXECUTED && !elsewhere[d] -> FAULT; stage[d] = WARNED }
-  :: atomic { fault && (stage[d] != NONE || mode[d] == WATCHES) && !elsewhere[d] ->
+  :: atomic { fault && mode[d] != LOOKS && !elsewhere[d] ->
        FAULT;
        if
        :: LATE && stage[d] == SENT && !late_kind ->
