@@ -234,16 +234,13 @@ proctype Daemon(byte d) {
        if :: saw_free[d] && since[d] == 0 -> REACHED(11) :: else fi;
        elsewhere[d] = false;
        mode[d] = TAKES; since[d] = 0; send(d, TAKE) }
-  :: atomic { mode[d] == TAKES && stage[d] == CONFIRMED ->
-       if
-       :: epoch == its_epoch[d] -> serve(d)
-       :: else -> looks(d)
-       fi }
+  :: atomic { mode[d] == TAKES && stage[d] == CONFIRMED && epoch == its_epoch[d] -> serve(d) }
 #ifdef SERVES_EARLY             /* a takeover serves before the copy has its epoch */
   :: atomic { mode[d] == TAKES && stage[d] == EXECUTED -> serve(d) }
 #endif
 #ifndef GIVES_UP                /* a standby that came too late looks no more */
-  :: atomic { mode[d] == TAKES && stage[d] == REFUSED -> REACHED(4); looks(d) }
+  :: atomic { mode[d] == TAKES && (stage[d] == REFUSED || (stage[d] == CONFIRMED && epoch != its_epoch[d])) ->
+       REACHED(4); looks(d) }
 #endif
   /* it serves: batches, renewals, and what came of them */
   :: atomic { serves(d) && idle(d) && number[d] < BATCHES &&
