@@ -13,7 +13,6 @@ from test_store_ledger import BATCHES, at_work
 
 from enact_dist.core.protocol.records import HistoryForgotten, Persist
 from enact_dist.link.postgres import ahead, opening
-from enact_dist.link.postgres.address import FreeShard
 from enact_dist.link.postgres.standby import wait_free
 from enact_dist.terms import Durability
 
@@ -54,9 +53,8 @@ def _same_as_fresh(medium, address, rows):
     """Compare all that a store begins with."""
     session, shard = medium.line._session, medium._tenure.shard
     seen = opening.look(session, address)[1]
-    late, fresh = (
-        opening._read(session, shard, FreeShard(address, seen, held)) for held in (rows, {})
-    )
+    held = opening.HeldShard(medium, session, shard, seen.epoch, seen.batch)
+    late, fresh = (opening.read_whole(held, "a test", some) for some in (rows, {}))
     for one in fields(fresh):
         if one.name == "states":
             for name in ("newest", "history", "blobs", "causes", "prepared"):

@@ -11,9 +11,13 @@ Rules that a change must keep:
 
 from __future__ import annotations
 
+import logging
 import os
 import socket
-from contextlib import nullcontext, suppress
+import threading
+import time
+import weakref
+from contextlib import contextmanager, nullcontext, suppress
 from typing import TYPE_CHECKING, Any, Final
 
 import psycopg
@@ -22,10 +26,9 @@ from psycopg.conninfo import conninfo_to_dict
 
 from enact_dist.config.types import without_password
 from enact_dist.errors import StoreError
-from enact_dist.link.postgres.lookout import Lookout
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
     from contextlib import AbstractContextManager
 
     from enact_dist.link.postgres.address import StoreAddress
@@ -53,6 +56,13 @@ _LAST_WORDS: Final = frozenset({"FATAL", "PANIC"})
 """What an idle connection gets as a notice when the server ends it."""
 LOST: Final = (psycopg.OperationalError, psycopg.InterfaceError, errors.ReadOnlySqlTransaction)
 """Errors of a connection, of which `is_lost` picks those that a new one may mend."""
+
+
+HUNG_S: Final = 3.0
+"""How long an answer may be away before other hosts are asked whether they take writes."""
+LOOK_S: Final = 0.5
+"""How often that is looked at."""
+_log = logging.getLogger("enact.store")
 
 
 class Connector:
@@ -90,7 +100,7 @@ class Connector:
         return DatabaseSession(connection)
 
     def waiting(self, session: DatabaseSession) -> AbstractContextManager[None]:
-        """Return a context in which a session is left whose server hangs; see `lookout`."""
+        """Return a context in which a session is left whose server hangs."""
         return self._lookout.over(session) if self._lookout is not None else nullcontext()
 
     @staticmethod
@@ -172,6 +182,57 @@ class DatabaseSession:
         """Close the connection; idempotent."""
         with suppress(psycopg.Error):
             self.connection.close()
+
+
+class Lookout:
+    """Leaves a server that hangs once another host takes writes.  It ends with its connector.
+
+    A server whose processes stand still keeps its connections, and its kernel answers for it, so no
+    time-out of the network ends the wait.  A wait for the standby looks the same, and nothing may
+    cut that short: a connection is given up only when another host is the primary.
+
+    Args:
+        connector: Knows the hosts.
+    """
+
+    def __init__(self, connector: Connector) -> None:
+        self._waits: dict[DatabaseSession, float] = {}
+        self._thread = threading.Thread(
+            target=_look_out,
+            args=(weakref.ref(connector), self._waits),
+            name="enact-lookout",
+            daemon=True,
+        )
+        self._thread.start()
+
+    @contextmanager
+    def over(self, session: DatabaseSession) -> Iterator[None]:
+        """Look out while the calling thread waits for answers of a session."""
+        self._waits[session] = time.monotonic()
+        try:
+            yield
+        finally:
+            self._waits.pop(session, None)
+
+
+def _look_out(of: weakref.ref[Connector], waits: dict[DatabaseSession, float]) -> None:
+    while True:
+        time.sleep(LOOK_S)
+        connector = of()
+        if connector is None:
+            return
+        now_s = time.monotonic()
+        for session, since_s in list(waits.items()):
+            if now_s - since_s < HUNG_S:
+                continue
+            found = connector.primary_beside(session)
+            if found and waits.get(session) == since_s:
+                _log.warning(
+                    "%s has not answered for %.1f s, and %s takes writes: going there",
+                    connector.host_of(session), now_s - since_s, found,
+                )  # fmt: skip
+                session.break_off()
+        del connector
 
 
 def _keywords_of(places: Sequence[tuple[str, str]]) -> dict[str, str]:

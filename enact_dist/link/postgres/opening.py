@@ -77,16 +77,26 @@ def open_database(free: FreeShard, *, unix_s: int) -> tuple[Store, Recovered]:
     with database_errors(name):
         held = take_over(free, unix_s=unix_s)
         try:
-            contents = read_rows(held, name, free.rows)
-            bodies = ReadBodies(name, streamed(held.session, BODIES, (held.shard,)))
-            read_blobs(contents, bodies, power_cut=False)
-            put_together(contents, name)
-            contents.recovered.epoch = held.epoch
+            contents = read_whole(held, name, free.rows)
             store = Store(held.medium, contents, wall_ns=unix_s * 1_000_000_000)
         except BaseException:
             held.medium.close()
             raise
     return store, contents.recovered
+
+
+def read_whole(held: HeldShard, name: str, ahead: Mapping[int, CheckedRow]) -> Contents:
+    """Read and check a shard with its bodies, but for the rows that were read ahead.
+
+    Raises:
+        As `read_rows`.
+    """
+    contents = read_rows(held, name, ahead)
+    bodies = ReadBodies(name, streamed(held.session, BODIES, (held.shard,)))
+    read_blobs(contents, bodies, power_cut=False)
+    put_together(contents, name)
+    contents.recovered.epoch = held.epoch
+    return contents
 
 
 class HeldShard(NamedTuple):
