@@ -70,7 +70,9 @@ def test_an_old_daemon_writes_nothing(server, stores):
         old, _, medium = stores.open(address)
         old.write([state(1)])
         epoch, _, holder = row_of(server, address)
-        beat = server.execute("SELECT beat FROM enact.shard WHERE epoch = %s", (epoch,))[0][0]
+        ((beat,),) = server.execute(
+            "SELECT beat FROM enact.shard WHERE name = %s", (address.shard,)
+        )
         medium._renewer.close()
         free = FreeShard(address, HolderRow(epoch, 0, beat, holder))
         new, recovered = open_database(free, unix_s=1)
