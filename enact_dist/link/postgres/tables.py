@@ -48,6 +48,7 @@ RESIGN: Final = """
 UPDATE enact.shard SET beat = beat + 1, holder = '' WHERE id = %b AND epoch = %b RETURNING beat
 """
 FILL: Final = "UPDATE enact.shard SET batch = %b WHERE id = %b RETURNING batch"
+CLOCK: Final = "SELECT extract(epoch FROM clock_timestamp())::bigint"
 RAISE: Final = """
 UPDATE enact.shard SET epoch = %b, beat = beat + 1, holder = '' WHERE id = %b RETURNING epoch
 """
