@@ -11,6 +11,7 @@ from enact_dist.core.failover.lease import HolderRow
 from enact_dist.link.lease import ShardTakenError
 from enact_dist.link.postgres.address import FreeShard, ShardHeldError, StoreAddress
 from enact_dist.link.postgres.opening import open_database
+from enact_dist.link.postgres.restored import raise_epochs
 
 LEASE_S = 0.5
 
@@ -55,7 +56,8 @@ def test_every_epoch_rises_above_the_clock_and_every_shard_is_free(cell, server,
     assert said["not_in_database"] == ["third"]
     assert [shard["holder"] for shard in said["shards"]] == ["gone 17", "gone 17"]
     for shard, row in after.items():
-        assert (row.beat, row.holder) == (before[shard].beat + 1, "")
+        assert row.beat > before[shard].beat
+        assert not row.holder
         assert row.batch == before[shard].batch
     _, recovered, _ = stores.open(address("left"))
     assert recovered.epoch == after["left"].epoch + 1
@@ -98,9 +100,10 @@ def test_what_is_not_there_is_named(cell, stores, capsys, tmp_path):
 
 def test_a_standby_that_saw_the_shard_before_takes_nothing(cell, server, stores):
     """Its look is out of date."""
-    address, file = cell
+    address, _ = cell
     stores.open(address("left"))[0].close()
     seen = rows_of(server, address("left"))["left"]
-    assert main(["shard", "restored", "left", "--cell", file]) == 0
+    (raised,) = raise_epochs(server.url, address("").cell, ["left"], lease_s=LEASE_S, unix_s=1)
+    assert abs(raised.epoch - time.time()) < 60, "the clock of the database counts, too"
     with pytest.raises(ShardHeldError):
         open_database(FreeShard(address("left"), seen), unix_s=1)

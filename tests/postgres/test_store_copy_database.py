@@ -1,23 +1,28 @@
 """A shard moves between folder and database with everything it has, or not at all."""
 
 import json
+import os
 import pickle
 import re
 import sqlite3
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import store_workload
+from replicated_cell import SHARD, ReplicatedCell
 from shard_stores import CELL, address_of, state, take, versions
 from store_model import State
 
 import enact_dist
+from enact_dist import Aspect, Entity, Lock, Retention, Write, connect, local
 from enact_dist.cli.main import main
 from enact_dist.errors import StoreError
 from enact_dist.link.lease import ShardTakenError
 from enact_dist.link.offline import store_copy
 from enact_dist.link.offline.store_copy import export_store, import_store
+from enact_dist.link.postgres.address import StoreAddress
 from enact_dist.link.postgres.bodies import PART_BYTES
 from enact_dist.link.store.store import open_store
 
@@ -201,13 +206,54 @@ def test_damage_is_not_copied_to_a_database(server, tmp_path):
     address, folder = address_of(server.url), tmp_path / "left"
     with closing(open_store(folder, unix_s=1)[0]) as store:
         store.write([state(1, "large", body=LARGE)])
+        newer = state(2, "large")
+        record = replace(newer.records[0], history=True)
+        store.write([replace(newer, records=(record,))])
     (body,) = (folder / "blobs").iterdir()
     with body.open("r+b") as file:
         file.seek(PART_BYTES + 7)
         file.write(b"\xff\xfe")
+    open_store(folder, unix_s=1)[0].close()
     with pytest.raises(StoreError, match="damaged"):
         import_store(folder, address, unix_s=1)
     assert not table_rows(server, address)
+
+
+def test_a_daemon_serves_what_was_copied(server, tmp_path, shard_name):
+    """Clients find history and labels, and go on with the next version."""
+    entity, told = Entity("box"), []
+    aspect = Aspect("pose", list, retention=Retention(versions=5))
+    with local(tmp_path / "folder", worlds=("online",)) as cell:
+        world = cell.world("online")
+        for number in range(3):
+            with Lock(write := Write(world, entity, aspect)) as lock:
+                lock[write] = [number]
+        before = world.history(entity, aspect)
+        cell.pin("kept", before[:1])
+        epoch = cell.shards()[0].epoch
+    served = ReplicatedCell(tmp_path, server.url, os.environ, name=f"copied{shard_name}")
+    place = StoreAddress(server.url, f"copied{shard_name}", SHARD)
+
+    import_store(tmp_path / "folder", place, unix_s=1, tell=lambda *facts: told.append(facts))
+
+    assert told[0][0] == "rows copied"
+    assert {what for what, _, _ in told} >= {"rows compared"}
+    try:
+        served.start(0)
+        with connect(served.file, timeout_s=20.0) as cell:
+            world = cell.world("online")
+            after = world.history(entity, aspect)
+            assert [(v.version, v.position.stamp_ns) for v in after] == [
+                (v.version, v.position.stamp_ns) for v in before
+            ]
+            assert [v.version for v in cell.pinned()["kept"]] == [before[0].version]
+            assert cell.shards()[0].epoch > epoch
+            with Lock(write := Write(world, entity, aspect)) as lock:
+                assert lock[write] == [2]
+                lock[write] = [3]
+            assert world.history(entity, aspect)[-1].version == before[-1].version + 1
+    finally:
+        served.end()
 
 
 def test_the_commands_say_what_they_did(server, tmp_path, capsys, shard_name):

@@ -58,7 +58,7 @@ def writes_without_a_fence(patch):
     """A batch is written whoever has the shard."""
 
     def putting(self, number, batch, row):
-        return daemons.RowChange(row._replace(batch=number, beat=row.beat + 1), batch)
+        return daemons.RowChange(row._replace(batch=number, beat=self._beat_after(row)), batch)
 
     patch(SimulatedDaemon, "putting", putting)
 
@@ -79,7 +79,9 @@ def sends_again_unasked(patch):
     def putting(self, number, batch, row):
         if row.epoch != self._epoch:
             return None
-        return daemons.RowChange(row._replace(batch=row.batch + 1, beat=row.beat + 1), batch)
+        return daemons.RowChange(
+            row._replace(batch=row.batch + 1, beat=self._beat_after(row)), batch
+        )
 
     def after_break(found, *, epoch, batch):
         return lease.BrokenBatch.MISSING if found[0] == epoch else lease.BrokenBatch.TAKEN
@@ -111,7 +113,9 @@ def takes_what_it_finds(patch):
     """A takeover does not name the row that the standby saw."""
 
     def taking(self, _seen, epoch, found):
-        return daemons.RowChange(lease.HolderRow(epoch, found.batch, found.beat + 1, self.name))
+        return daemons.RowChange(
+            lease.HolderRow(epoch, found.batch, self._beat_after(found), self.name)
+        )
 
     patch(SimulatedDaemon, "taking", taking)
 

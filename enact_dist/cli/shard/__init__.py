@@ -109,7 +109,7 @@ VERBS: Final = (
         (
             CELL_FILE,
             _store("folder of a shard: a copy of one on another host, or of one that leaves the"
-                   " cell"),
+                   " cell; not in a cell with a database, where all are found"),
             many("--new", "NAME", "this shard is new: it is no mistake that it has no data yet",
                  default=[]),
             flag("--dry-run", "list what would move, change nothing"),

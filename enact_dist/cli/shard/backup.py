@@ -73,7 +73,8 @@ def _folder(config: CellConfig, options: argparse.Namespace) -> Path:
             config,
             f"enact shard {options.verb.name} copies a folder",
             "pg_dump -n enact backs all shards up together, pg_restore brings them back while the"
-            " cell is stopped (pg_basebackup: to a point in time)",
+            " cell is stopped (pg_basebackup: to a point in time), then say enact shard restored;"
+            " enact shard export-store copies one shard to a folder",
         )
     folder = options.folder or config.shard(options.name).folder
     if folder is None:

@@ -41,7 +41,7 @@ class HolderRow(NamedTuple):
     Attributes:
         epoch: Of the daemon that has the shard.
         batch: Number of its last batch.
-        beat: Counts its writes and renewals.
+        beat: Another one after each write and renewal, never used again.
         holder: The process that has it; "": it has given the shard back.
     """
 

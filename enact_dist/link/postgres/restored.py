@@ -17,7 +17,7 @@ from enact_dist.errors import StoreError
 from enact_dist.link.postgres.connection import CONFIRMED, Connector, myself
 from enact_dist.link.postgres.medium import database_errors
 from enact_dist.link.postgres.standby import LOOK_S
-from enact_dist.link.postgres.tables import MISSING, RAISE, SHARDS
+from enact_dist.link.postgres.tables import CLOCK, MISSING, RAISE, SHARDS
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -65,7 +65,7 @@ def raise_epochs(
         cell: Name of the cell.
         shards: Their names; empty: all that the database has of this cell.
         lease_s: The lease of their daemons.
-        unix_s: The wall clock, seconds since 1970.
+        unix_s: The wall clock of this host, seconds since 1970; that of the database counts, too.
         fence: Whether to take shards from daemons that serve them.
 
     Raises:
@@ -96,9 +96,10 @@ def raise_epochs(
                     name,
                     _REMEDY,
                 )
+            there_s = (session.row(CLOCK) or (0,))[0]
             raised = []
             for shard, (row_id, row) in found.items():
-                epoch = max(row.epoch + 1, unix_s)
+                epoch = max(row.epoch + 1, unix_s, there_s)
                 session.row(RAISE, (epoch, row_id))
                 raised.append(RaisedEpoch(shard, row.epoch, epoch, row.batch, row.holder))
         session.check()

@@ -1,7 +1,8 @@
 """The tables of the shards of a database, and the statements that write them.
 
 One row of `shard` per shard decides who may write: each batch, and each renewal of a lease, updates
-it on condition of the epoch, or writes nothing.
+it on condition of the epoch, or writes nothing.  Its beat grows by a random step each time: after a
+failover that lost a beat, a standby that saw it must not take the next one for the same.
 """
 
 from __future__ import annotations
@@ -41,20 +42,21 @@ WHERE to_regclass(name) IS NULL
 STATE: Final = "SELECT id, format, epoch, batch, beat, holder FROM enact.shard"
 _ONE: Final = " WHERE cell = %b AND name = %b"
 FENCE: Final = """
-UPDATE enact.shard SET epoch = %b, beat = beat + 1, holder = %b WHERE id = %b RETURNING epoch
+UPDATE enact.shard SET epoch = %b, beat = beat + 1 + (random() * 1e9)::bigint, holder = %b WHERE id = %b RETURNING epoch
 """
-RENEW: Final = "UPDATE enact.shard SET beat = beat + 1 WHERE id = %b AND epoch = %b RETURNING beat"
+RENEW: Final = "UPDATE enact.shard SET beat = beat + 1 + (random() * 1e9)::bigint WHERE id = %b AND epoch = %b RETURNING beat"
 RESIGN: Final = """
-UPDATE enact.shard SET beat = beat + 1, holder = '' WHERE id = %b AND epoch = %b RETURNING beat
+UPDATE enact.shard SET beat = beat + 1 + (random() * 1e9)::bigint, holder = '' WHERE id = %b AND epoch = %b RETURNING beat
 """
 FILL: Final = "UPDATE enact.shard SET batch = %b WHERE id = %b RETURNING batch"
+CLOCK: Final = "SELECT extract(epoch FROM clock_timestamp())::bigint"
 RAISE: Final = """
-UPDATE enact.shard SET epoch = %b, beat = beat + 1, holder = '' WHERE id = %b RETURNING epoch
+UPDATE enact.shard SET epoch = %b, beat = beat + 1 + (random() * 1e9)::bigint, holder = '' WHERE id = %b RETURNING epoch
 """
 REACHED: Final = "SELECT epoch, batch FROM enact.shard WHERE id = %b"
 WRITE: Final = """
 WITH fence AS (
-    UPDATE enact.shard SET batch = %b, beat = beat + 1
+    UPDATE enact.shard SET batch = %b, beat = beat + 1 + (random() * 1e9)::bigint
     WHERE id = %b AND epoch = %b AND batch = %b RETURNING id
 ), gone AS (
     DELETE FROM enact.record USING fence

@@ -101,6 +101,7 @@ class SimulatedDaemon(ShardNode):
         self.database = database
         self.lease = Lease(lease_ns)
         self.serving = False
+        self._beats = world.schedule.stream(f"beats of {name}")
         self._epoch = self._batch = 0
         self._queue: list[Persist] = []
         self._writing = False
@@ -165,7 +166,11 @@ class SimulatedDaemon(ShardNode):
         """Return the row of a takeover, if the shard's row is the one that was seen."""
         if (seen.epoch, seen.beat) != (found.epoch, found.beat):
             return None
-        return RowChange(HolderRow(epoch, found.batch, found.beat + 1, self.name))
+        return RowChange(HolderRow(epoch, found.batch, self._beat_after(found), self.name))
+
+    def _beat_after(self, row: HolderRow) -> int:
+        """Return a beat that no write has left before, not even one that a failover lost."""
+        return row.beat + 1 + self._beats.getrandbits(30)
 
     def _load(self) -> None:
         line = self._lines[0]
@@ -220,7 +225,7 @@ class SimulatedDaemon(ShardNode):
         """Return the row of a batch with its records, if it follows the one before."""
         if (row.epoch, row.batch) != (self._epoch, number - 1):
             return None
-        return RowChange(row._replace(batch=number, beat=row.beat + 1), batch)
+        return RowChange(row._replace(batch=number, beat=self._beat_after(row)), batch)
 
     def _sent(self, batch: tuple[Persist, ...], sent_ns: int, done: StatementDone) -> None:
         if done.warned:
@@ -270,7 +275,11 @@ class SimulatedDaemon(ShardNode):
 
     def _beat(self, connection: Wire, done: Callable[[StatementDone], None]) -> None:
         def beat(row: HolderRow) -> RowChange | None:
-            return RowChange(row._replace(beat=row.beat + 1)) if row.epoch == self._epoch else None
+            return (
+                RowChange(row._replace(beat=self._beat_after(row)))
+                if row.epoch == self._epoch
+                else None
+            )
 
         self.database.write(connection, beat, done)
 
