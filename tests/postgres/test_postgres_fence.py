@@ -69,9 +69,9 @@ def test_an_old_daemon_writes_nothing(server, stores):
     for body in (b"", bytes(70_000)):
         old, _, medium = stores.open(address)
         old.write([state(1)])
+        medium._renewer.close()
         epoch, _, holder = row_of(server, address)
         beat = server.execute("SELECT beat FROM enact.shard WHERE epoch = %s", (epoch,))[0][0]
-        medium._renewer.close()
         free = FreeShard(address, HolderRow(epoch, 0, beat, holder))
         new, recovered = open_database(free, unix_s=1)
         with closing(new):
