@@ -171,12 +171,9 @@ class ShardHost:
 
     def figures(self) -> dict[str, float]:
         """Return counters and current values, by name; see `link.host_figures`."""
-        return figures_of(
-            self._shard.state,
-            self._payloads,
-            parked=len(self._replies),
-            now_ns=self._clock.monotonic_ns(),
-        )
+        parts = self._shard.state, self._payloads, self.silence
+        now_ns = self._clock.monotonic_ns()
+        return figures_of(*parts, parked=len(self._replies), now_ns=now_ns)
 
     def latencies(self) -> dict[str, Latencies]:
         """Return latencies, by name; see `link.host_figures`."""
@@ -216,7 +213,8 @@ class ShardHost:
             self._stage(cast("Stage", message), reply, identity, subject)
             return
         elif kind is ListSessions:
-            self._shard.counters.update(self._payloads.figures())
+            more = self.silence.rounded() if self.silence else {}
+            self._shard.counters.update(self._payloads.figures() | more)
         with self._mutex:
             if self._ended:
                 return

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from enact_dist.core.shard.state import ShardState
+    from enact_dist.link.lease import AnswerGate
     from enact_dist.link.memory.payload_desk import PayloadDesk
     from enact_dist.link.store.thread import StoreThread
 
@@ -27,13 +28,14 @@ _log = logging.getLogger("enact.shard")
 
 
 def figures_of(
-    state: ShardState, payloads: PayloadDesk, *, parked: int, now_ns: int
+    state: ShardState, payloads: PayloadDesk, gate: AnswerGate | None, *, parked: int, now_ns: int
 ) -> dict[str, float]:
     """Return counters and current values, by name.
 
     Args:
         state: State of the shard.
         payloads: The shard's large data.
+        gate: Its lease, in a cell with a store.
         parked: Number of parked requests.
         now_ns: This host's monotonic clock.
     """
@@ -43,6 +45,7 @@ def figures_of(
     return {
         **counted(state),
         **payloads.figures(),
+        **(gate.figures() if gate is not None else {}),
         "ready": state.grants,
         "epoch": state.epoch,
         "uptime_seconds": (now_ns - state.born_ns) / 1e9,

@@ -81,8 +81,15 @@ class Holding(Protocol):
     def lease(self) -> HostLease:
         """How long this process may answer."""
 
+    @property
+    def copies(self) -> int:
+        """How many standbys of the database confirm each commit; -1: not visible."""
+
     def on_failure(self, failed: Callable[[Exception], None]) -> None:
         """Call `failed`, once, when the lease cannot be renewed any more."""
+
+    def on_move(self, moves: Callable[[str], None]) -> None:
+        """Call `moves`, once, with the standby that the shard is asked to go to."""
 
     def end_soon(self) -> None:
         """Wait for no database from now on; from any thread."""
@@ -103,7 +110,8 @@ class AnswerGate:
     """
 
     def __init__(self, holding: Holding, count: Callable[[str], None]) -> None:
-        self.end_soon = holding.end_soon
+        self.end_soon, self.on_move = holding.end_soon, holding.on_move
+        self._holding = holding
         self._lease = holding.lease
         self._count = count
         self._silence = Silence(holding.lease.lease)
@@ -112,6 +120,19 @@ class AnswerGate:
     def holds(self) -> bool:
         """Whether answers go out."""
         return self._lease.holds
+
+    def figures(self) -> dict[str, float]:
+        """Return current values, by name."""
+        since_ns = self._silence.since_ns
+        return {
+            "store_copies": self._holding.copies,
+            "lease_left_s": max(0.0, self._lease.left_s),
+            "store_stalled_s": (self._lease.now_ns() - since_ns) / 1e9 if since_ns else 0.0,
+        }
+
+    def rounded(self) -> dict[str, int]:
+        """Return `figures` as counters, which are whole numbers."""
+        return {name: round(value) for name, value in self.figures().items()}
 
     @classmethod
     def of(

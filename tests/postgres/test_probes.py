@@ -7,9 +7,11 @@ import urllib.request
 
 import pytest
 from ports import free_port
+from postgres_nodes import await_sync
 from replicated_cell import SHARD, ReplicatedCell
 from tcp_proxy import TcpProxy
 
+from enact_dist.cli.main import main
 from enact_dist.config.environment import variable_of
 from enact_dist.link.daemon.metrics import SEES_S
 from enact_dist.link.log import READY, STANDS_BY
@@ -37,6 +39,13 @@ class ProbedCell(ReplicatedCell):
                 return answer.status, answer.read().decode()
         except urllib.error.HTTPError as error:
             return error.code, error.read().decode()
+
+    def shows(self, place, name, condition):
+        """Wait until a metric has a value."""
+        end_s = time.monotonic() + 20.0
+        while not condition(found := value(self.ask(place, "/metrics")[1], name)):
+            assert time.monotonic() < end_s, (name, found)
+            time.sleep(0.05)
 
     def becomes(self, place, path, status):
         """Wait until a probe answers with a status."""
@@ -78,3 +87,34 @@ def test_a_standby_is_ready_while_it_sees_its_database_and_alive_without(cell, s
         _, page = cell.ask(1, "/metrics")
         assert f'shard="{SHARD}"}} 1\n' in page.partition("enact_ready{")[2]
         assert f'shard="{SHARD}"}} 0\n' in page.partition("enact_standby{")[2]
+        assert f'shard="{SHARD}"}} 1\n' in page.partition("enact_takeovers_total{")[2]
+
+
+def value(page, name):
+    """Return the value of a metric."""
+    (line,) = [line for line in page.splitlines() if line.startswith(name + "{")]
+    return float(line.rpartition(" ")[2])
+
+
+def test_a_page_shows_copies_the_lease_and_a_stall(pair, tmp_path, shard_name, capsys):
+    """A standby that confirms nothing stalls the store; the lease runs out, and comes back."""
+    first, second = pair
+    await_sync(first)
+    cell = ProbedCell(tmp_path, first.url, f"shown{shard_name}")
+    try:
+        cell.start(0)
+        cell.shows(0, "enact_store_copies", lambda copies: copies == 1)
+        cell.shows(0, "enact_lease_left_s", lambda left_s: 1.0 < left_s <= 2.0)
+        assert main(["shard", "ls", "--counters", "--cell", str(cell.file)]) == 0
+        assert "store_copies" in capsys.readouterr().out
+        second.pause()
+        try:
+            cell.shows(0, "enact_store_stalled_s", lambda stalled_s: stalled_s > 0.2)
+            cell.shows(0, "enact_lease_left_s", lambda left_s: left_s == 0)
+        finally:
+            second.go_on()
+        cell.shows(0, "enact_store_stalled_s", lambda stalled_s: stalled_s == 0)
+        cell.shows(0, "enact_lease_left_s", lambda left_s: left_s > 0)
+        assert value(cell.ask(0, "/metrics")[1], "enact_takeovers_total") == 0
+    finally:
+        cell.end()

@@ -21,6 +21,8 @@ from enact_dist.link.daemon.counters import BODIES
 CHECK_S: Final = 2.0
 """How long a health check waits: it is called every few seconds, and a local answer takes 1 ms."""
 
+MOVE_S: Final = 20.0
+"""How long a hand-over may take, with the drain of the daemon that serves."""
 _NAME: Final = option("name", "NAME", "name of the shard in cell.toml")
 _FOLDER: Final = file_of("--folder", "DIR", "folder of the shard, unless it is that of cell.toml")
 
@@ -99,6 +101,21 @@ VERBS: Final = (
             JSON,
         ),
         page="security",
+    ),
+    Verb(
+        "move",
+        "in a cell with a store: let the daemon that serves a shard hand it over to a standby, and"
+        " stand by itself",
+        "move:move_shard",
+        "enact shard move left --to cell-b --cell cell.toml",
+        (
+            _NAME,
+            option("--to", "HOST", "the host of the standby; with a space and its process number if"
+                   " it has several", required=True),
+            *READER,
+        ),
+        defaults={"timeout_s": MOVE_S},
+        page="surviving",
     ),
     Verb(
         "rebalance", "move entities to where cell.toml places them, while the cell is stopped",

@@ -151,6 +151,23 @@ OF_A_SHARD: Final[dict[str, Figure]] = {
         "disk writes that took more than a second",
         "move the shard's folder to another disk; the shard's log gives the times",
     ),
+    "store_copies": _gauge(
+        "standbys of the cell's database that confirm each commit; 0 in a cell with folders; -1 if"
+        " the cell's user cannot see them (GRANT pg_monitor)",
+        "if 0 in a cell with a store, a commit stands on one host only: enact doctor",
+    ),
+    "lease_left_s": _gauge(
+        "seconds that the shard may still answer without news of its database; 0 in a cell with"
+        " folders"
+    ),
+    "store_stalled_s": _gauge(
+        "seconds that answers have waited now, since the database confirms nothing",
+        "look at the database and the way to it: enact doctor",
+    ),
+    "takeovers": Figure(
+        "1 if this start took the shard over from a daemon that had not given it back",
+        "the log of that daemon, or of its host, gives the reason",
+    ),
     "silences": Figure(
         "times that answers waited, since the database had confirmed nothing for `lease_s`",
         "look at the database and the way to it: enact doctor",

@@ -63,6 +63,9 @@ class RunningShard:
         free: The shard in a database that it takes over, in place of a folder.
         session: The Zenoh session that serves it, which clients know already; None: a new one.
         metrics: A server that shows this shard from now on; None: a new one, if one is wanted.
+
+    Attributes:
+        moves_to: The standby that an operator asked it to give the shard to; "": none.
     """
 
     def __init__(
@@ -78,6 +81,7 @@ class RunningShard:
         self._stopping = threading.Lock()
         self._stopped = False
         self._failure: Exception | None = None
+        self.moves_to = ""
         self._shared = _shared_folder(settings)
         shard = replace(settings.shard, start=secrets.randbits(62))
         if self._shared is not None:
@@ -93,6 +97,8 @@ class RunningShard:
                 payload_bytes_max=settings.shared_bytes_max,
             )
             undo.callback(self.host.close)
+            if free is not None and free.seen.holder:
+                self.host.count("takeovers")
             self._sockets: SocketService | None = None
             if self._shared is not None and settings.carrier != "zenoh":
                 self._sockets = SocketService(self.host, self._shared)
@@ -123,6 +129,7 @@ class RunningShard:
             if self.host.silence is not None:
                 self._successor = Successor(self.host, settings, self._has_failed)
                 undo.callback(self._successor.close)
+                self.host.silence.on_move(self._move)
             self.reload: Reload | None = None
             if settings.keys is not None or settings.shard.rights is not None:
                 self.reload = Reload(self._take_again, self.host.count, settings.keys, certificate)
@@ -146,6 +153,13 @@ class RunningShard:
             # Another process serves the shard: whatever is still in this one must not leave it.
             last_words(formatter_of(self.settings), f"this process ends at once: {failure}")
             os._exit(1)
+        self._ended.set()
+
+    def _move(self, to: str) -> None:
+        _log.info(
+            "shard %s goes to %s", self.settings.shard.name, to, extra={"event": "shard.move"}
+        )
+        self.moves_to = to
         self._ended.set()
 
     def _open_session(self) -> zenoh.Session:
@@ -190,7 +204,7 @@ class RunningShard:
         before.close()
         close_session(self._session)
         try:
-            self._session = self._reopened()
+            self._session = _reopened(self._open_session)
             self._service = self._served()
         except Exception as error:
             _log.critical("shard %s cannot listen again: %s", self.settings.shard.name, error)
@@ -204,16 +218,6 @@ class RunningShard:
         timer = threading.Timer(grace_s, self._report_absent, (tuple(before.present),))
         timer.daemon = True
         timer.start()
-
-    def _reopened(self) -> zenoh.Session:
-        end_s = time.monotonic() + REOPEN_S
-        while True:
-            try:
-                return self._open_session()
-            except LinkError:  # the old socket is not closed yet
-                if time.monotonic() > end_s:
-                    raise
-                time.sleep(REOPEN_PAUSE_S)
 
     def _report_absent(self, before: Iterable[tuple[str, str]]) -> None:
         """Report the tokens that have not come back: their clients ended during a reload."""
@@ -305,6 +309,18 @@ def _session_of(settings: DaemonSettings, names: Mapping[str, str] | None) -> ze
     )
 
 
+def _reopened(opened: Callable[[], zenoh.Session]) -> zenoh.Session:
+    """Open a session at a port that this process has just given up."""
+    end_s = time.monotonic() + REOPEN_S
+    while True:
+        try:
+            return opened()
+        except LinkError:  # the old socket is not closed yet
+            if time.monotonic() > end_s:
+                raise
+            time.sleep(REOPEN_PAUSE_S)
+
+
 def _shared_folder(settings: DaemonSettings) -> SharedFolder | None:
     """Make the folder that the shard shares with processes of this host.
 
@@ -371,7 +387,7 @@ def take_shard(
         waiting()
 
     with ExitStack() as undo:
-        session = _session_of(settings, settings.common_names)
+        session = _reopened(lambda: _session_of(settings, settings.common_names))
         undo.callback(close_session, session)
         metrics = None
         if settings.metrics is not None:

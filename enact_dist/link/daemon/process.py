@@ -14,6 +14,7 @@ import logging
 import signal
 import sys
 import threading
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.errors import EnactError
@@ -41,29 +42,41 @@ def run_shard(settings: DaemonSettings) -> int:
     formatter = formatter_of(settings)
     gc.set_threshold(*GC_THRESHOLDS)  # a large shard is read without full collections, too
     with Log(formatter), StopSignals() as signals:
-        try:
-            shard = _started(settings, signals.event, manager, formatter)
-        except EnactError as error:
-            if settings.log == "json":
-                _log.critical("shard %s: %s", name, error, extra={"event": "shard.refused"})
-            else:
-                print(f"shard {name}: {error}", file=sys.stderr, flush=True)
-            return 1
-        if shard is None:
-            return 0
-        try:
-            signals.call(lambda word: _stop(shard, word, manager))
-            signals.call_again(lambda _: shard.stop_now())
-            if shard.reload is not None:
-                signals.call_at(signal.SIGHUP, shard.reload)
-            shard.host.each_tick(lambda: manager.alive(shard.host.state))
-            _say_ready(shard, formatter)
-            manager.ready(shard.host.state)
-            _stay_responsive()
-            shard.wait()
-        finally:
-            shard.stop(drain_s=settings.drain_s)
-        return 1 if shard.failure is not None else 0
+        while True:
+            try:
+                shard = _started(settings, signals.event, manager, formatter)
+            except EnactError as error:
+                if settings.log == "json":
+                    _log.critical("shard %s: %s", name, error, extra={"event": "shard.refused"})
+                else:
+                    print(f"shard {name}: {error}", file=sys.stderr, flush=True)
+                return 1
+            if shard is None:
+                return 0
+            _serve(shard, signals, manager, formatter)
+            if shard.failure is not None:
+                return 1
+            if not shard.moves_to or signals.event.is_set():
+                return 0
+            settings = replace(shard.settings, standby=True)
+
+
+def _serve(
+    shard: RunningShard, signals: StopSignals, manager: ServiceManager, formatter: logging.Formatter
+) -> None:
+    """Serve until a signal, a failure, or a request to give the shard to a standby."""
+    try:
+        signals.call(lambda word: None if shard.wait(0) else _stop(shard, word, manager))
+        signals.call_again(lambda _: shard.stop_now())
+        if shard.reload is not None:
+            signals.call_at(signal.SIGHUP, shard.reload)
+        shard.host.each_tick(lambda: manager.alive(shard.host.state))
+        _say_ready(shard, formatter)
+        manager.ready(shard.host.state)
+        _stay_responsive()
+        shard.wait()
+    finally:
+        shard.stop(drain_s=shard.settings.drain_s)
 
 
 def _started(

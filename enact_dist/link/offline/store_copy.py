@@ -193,10 +193,12 @@ def export_store(
         held = take_over(free, unix_s=unix_s)
         with closing(held.medium):
             contents = read_rows(held, name)
-            told = _Told(contents, tell)
+            told, line = _Told(contents, tell), held.medium.line
             with folder_errors(folder), partial_folder(folder, ".exporting") as partial:
                 _build(held, partial, told, batch=contents.batch, unix_s=unix_s)
-                held.medium.line.renew()  # no other process has changed the shard meanwhile
+                line.again(
+                    line.confirm, lambda _: False
+                )  # no other process has changed the shard meanwhile
                 if not renamed(partial, folder):
                     raise _is_full(folder)
     return told.done(held.epoch)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from enact_dist.config.types import without_password
 from enact_dist.core.failover.lease import HolderRow
@@ -50,6 +50,31 @@ class FreeShard:
     address: StoreAddress
     seen: HolderRow
     rows: dict[int, CheckedRow] = field(default_factory=dict)
+
+
+_TO: Final = " > "
+
+
+class HolderText(NamedTuple):
+    """What `holder` of a shard's row says.
+
+    Attributes:
+        process: The process that serves the shard; "": none.
+        to: The standby that the shard is to go to, or was given to; "": any.
+    """
+
+    process: str
+    to: str = ""
+
+    @classmethod
+    def read(cls, text: str) -> HolderText:
+        """Read it."""
+        process, _, to = f" {text}".partition(_TO)
+        return cls(process.strip(), to)
+
+    def __str__(self) -> str:
+        """Return it as it is stored while a process serves."""
+        return _TO.join(self) if self.to else self.process
 
 
 class ShardHeldError(StoreError):

@@ -17,8 +17,9 @@ from psycopg import errors
 
 from enact_dist.errors import StoreError
 from enact_dist.link.lease import ShardTakenError
+from enact_dist.link.postgres.address import HolderText
 from enact_dist.link.postgres.connection import CONFIRMED, LOST, is_lost
-from enact_dist.link.postgres.tables import REACHED, RENEW, RESIGN
+from enact_dist.link.postgres.tables import COUNT_COPIES, REACHED, RENEW, RESIGN
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -28,6 +29,10 @@ if TYPE_CHECKING:
 
 RENEW_S: Final = 0.4
 """A lease is renewed when nothing was confirmed for this long."""
+LOOK_S: Final = 1.0
+"""A busy store, whose batches renew its lease, is renewed this often all the same, for a look."""
+COPIES_S: Final = 5.0
+"""How often the database's copies are counted."""
 AGAIN_S: Final = 0.1
 """Pause before another try to connect."""
 CLOSE_S: Final = 1.0
@@ -82,7 +87,7 @@ class Line:
                 session.break_off()
 
     def again(
-        self, act: Callable[[DatabaseSession], None], done: Callable[[DatabaseSession], bool]
+        self, act: Callable[[DatabaseSession], object], done: Callable[[DatabaseSession], bool]
     ) -> None:
         """Act, and confirm the lease; wait for the database as long as it takes.
 
@@ -103,7 +108,7 @@ class Line:
                 sent_s = tenure.lease.now_s()
                 with tenure.connector.waiting(session):
                     if uncertain and done(session):
-                        self._confirm(session)
+                        self.confirm(session)
                     else:
                         uncertain = True
                         act(session)
@@ -118,18 +123,17 @@ class Line:
             self._back()
             return
 
-    def _confirm(self, session: DatabaseSession) -> None:
-        session.commit_as(CONFIRMED)
-        if session.row(RENEW, (self._tenure.shard, self._tenure.epoch)) is None:
-            raise self.taken()
-
-    def renew(self) -> None:
-        """Renew the lease by a write of its own.
+    def confirm(self, session: DatabaseSession) -> str:
+        """Renew the lease by a write of its own, as an act of `again`; return the row's holder.
 
         Raises:
             As `again`.
         """
-        self.again(self._confirm, lambda _: False)
+        session.commit_as(CONFIRMED)
+        found = session.row(RENEW, (self._tenure.shard, self._tenure.epoch))
+        if found is None:
+            raise self.taken()
+        return str(found[0])
 
     def reached(self, session: DatabaseSession) -> tuple[int, int]:
         """Return the epoch of the shard and its newest batch, as the database shows them."""
@@ -212,14 +216,20 @@ class Renewer:
 
     Args:
         tenure: Whose lease.
+
+    Attributes:
+        copies: How many standbys of the database confirm each commit; -1: this user cannot see it.
     """
 
     def __init__(self, tenure: HeldRow) -> None:
+        self.copies = 0
+        self._counted_s: float | None = None
         self._lease = tenure.lease
         self._line = Line(tenure)
         self._stopped = threading.Event()
         self._failure: Exception | None = None
         self._failed: Callable[[Exception], None] | None = None
+        self._moves: Callable[[str], None] | None = None
         self._thread = threading.Thread(target=self._renew_on, name="enact-lease", daemon=True)
         self._thread.start()
 
@@ -228,6 +238,10 @@ class Renewer:
         self._failed = failed
         if self._failure is not None:
             failed(self._failure)
+
+    def on_move(self, moves: Callable[[str], None]) -> None:
+        """Call `moves`, once, with the standby that the shard is asked to go to."""
+        self._moves = moves
 
     def check(self) -> None:
         """Raise what ended the renewals, if anything did."""
@@ -247,16 +261,27 @@ class Renewer:
         self._line.close()
 
     def _renew_on(self) -> None:
-        lease = self._lease
+        lease, looked_s = self._lease, self._lease.now_s()
         try:
             while not self._stopped.is_set():
-                # A batch renews as well, so only an idle store comes here.
                 due_s = lease.left_s - lease.usable_s + RENEW_S
-                if due_s <= 0:
-                    self._line.renew()
-                self._stopped.wait(max(due_s, 0.01) if due_s > 0 else RENEW_S)
+                if due_s <= 0 or lease.now_s() - looked_s > LOOK_S:
+                    self._line.again(self._renew, lambda _: False)
+                    looked_s, due_s = lease.now_s(), RENEW_S
+                self._stopped.wait(max(due_s, 0.01))
         except Exception as failure:  # noqa: BLE001 - the store must not go on without a lease
             if not self._stopped.is_set():
                 self._failure = failure
                 if self._failed is not None:
                     self._failed(failure)
+
+    def _renew(self, session: DatabaseSession) -> None:
+        to = HolderText.read(self._line.confirm(session)).to
+        if to and self._moves is not None:
+            moves, self._moves = self._moves, None
+            moves(to)
+        now_s = self._lease.now_s()
+        if self._counted_s is None or now_s - self._counted_s > COPIES_S:
+            self._counted_s = now_s
+            found = session.row(COUNT_COPIES)
+            self.copies = found[0] if found is not None else 0

@@ -49,7 +49,7 @@ class PostgresMedium:
         self.holding = self
         self.bodies = BodiesToWrite(tenure.epoch)
         self.lease = tenure.lease
-        self.on_failure = renewer.on_failure
+        self.on_failure, self.on_move = renewer.on_failure, renewer.on_move
         self.line = Line(tenure, session)
         self._tenure = tenure
         self._renewer = renewer
@@ -92,6 +92,11 @@ class PostgresMedium:
 
     def rest(self) -> None:
         """Do nothing: the database cleans up by itself."""
+
+    @property
+    def copies(self) -> int:
+        """See `Renewer`."""
+        return self._renewer.copies
 
     def end_soon(self) -> None:
         """Let whatever cannot reach the database fail soon; from any thread."""

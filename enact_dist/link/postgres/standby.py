@@ -11,7 +11,7 @@ import time
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.failover.lease import Standby
-from enact_dist.link.postgres.address import FreeShard, ShardHeldError
+from enact_dist.link.postgres.address import FreeShard, HolderText, ShardHeldError
 from enact_dist.link.postgres.ahead import ReadAhead
 from enact_dist.link.postgres.connection import LOST, connector_of, myself
 from enact_dist.link.postgres.medium import database_errors, in_one_line
@@ -104,7 +104,10 @@ def wait_free(
 def _look(session: DatabaseSession, address: StoreAddress, watch: Standby) -> tuple[int, HolderRow]:
     """Return the number of the shard's row, and the row."""
     began_s = time.monotonic()
-    found = look(session, address)
+    shard, seen = look(session, address)
     if time.monotonic() - began_s > address.lease_s / 2:
         watch.was_away()
-    return found
+    holder = HolderText.read(seen.holder)
+    if not holder.process and holder.to == myself():
+        seen = seen._replace(holder="")  # given to this process; all others wait for the lease
+    return shard, seen

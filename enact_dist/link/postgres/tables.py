@@ -42,16 +42,28 @@ WHERE to_regclass(name) IS NULL
 STATE: Final = "SELECT id, format, epoch, batch, beat, holder FROM enact.shard"
 _ONE: Final = " WHERE cell = %b AND name = %b"
 FENCE: Final = """
-UPDATE enact.shard SET epoch = %b, beat = beat + 1 + (random() * 1e9)::bigint, holder = %b WHERE id = %b RETURNING epoch
+UPDATE enact.shard SET epoch = %b, beat = beat + 1 + (random() * 1e9)::bigint, holder = %b
+WHERE id = %b RETURNING epoch
 """
-RENEW: Final = "UPDATE enact.shard SET beat = beat + 1 + (random() * 1e9)::bigint WHERE id = %b AND epoch = %b RETURNING beat"
+RENEW: Final = """
+UPDATE enact.shard SET beat = beat + 1 + (random() * 1e9)::bigint
+WHERE id = %b AND epoch = %b RETURNING holder
+"""
 RESIGN: Final = """
-UPDATE enact.shard SET beat = beat + 1 + (random() * 1e9)::bigint, holder = '' WHERE id = %b AND epoch = %b RETURNING beat
+UPDATE enact.shard SET beat = beat + 1 + (random() * 1e9)::bigint,
+    holder = CASE strpos(holder, '>') WHEN 0 THEN '' ELSE substr(holder, strpos(holder, '>')) END
+WHERE id = %b AND epoch = %b RETURNING beat
+"""
+"""Gives a shard back: to any standby, or to the one that it was asked for."""
+MOVE: Final = """
+UPDATE enact.shard SET holder = %s WHERE cell = %s AND name = %s AND epoch = %s AND holder = %s
+RETURNING epoch
 """
 FILL: Final = "UPDATE enact.shard SET batch = %b WHERE id = %b RETURNING batch"
 CLOCK: Final = "SELECT extract(epoch FROM clock_timestamp())::bigint"
 RAISE: Final = """
-UPDATE enact.shard SET epoch = %b, beat = beat + 1 + (random() * 1e9)::bigint, holder = '' WHERE id = %b RETURNING epoch
+UPDATE enact.shard SET epoch = %b, beat = beat + 1 + (random() * 1e9)::bigint, holder = ''
+WHERE id = %b RETURNING epoch
 """
 REACHED: Final = "SELECT epoch, batch FROM enact.shard WHERE id = %b"
 WRITE: Final = """
@@ -96,6 +108,12 @@ BODIES: Final = "SELECT name, data FROM enact.body WHERE shard = %b ORDER BY nam
 COPIES: Final = """
 SELECT application_name, sync_state, state FROM pg_stat_replication ORDER BY application_name
 """
+COUNT_COPIES: Final = """
+SELECT CASE WHEN count(*) > 0 AND count(sync_state) = 0 THEN -1
+    ELSE count(*) FILTER (WHERE sync_state IN ('sync', 'quorum')) END
+FROM pg_stat_replication
+"""
+"""Counts the standbys that confirm each commit; -1: this user cannot see what they do."""
 SHARDS: Final = """
 SELECT id, name, epoch, batch, beat, holder FROM enact.shard WHERE cell = %b ORDER BY name
 """
