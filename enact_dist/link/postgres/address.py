@@ -56,7 +56,7 @@ class FreeShard:
 _TO: Final = " > "
 
 
-class Holder(NamedTuple):
+class NamedHolder(NamedTuple):
     """What `holder` of a shard's row says.
 
     Attributes:
@@ -68,10 +68,17 @@ class Holder(NamedTuple):
     to: str = ""
 
     @classmethod
-    def read(cls, text: str) -> Holder:
+    def read(cls, text: str) -> NamedHolder:
         """Read it."""
         process, _, to = f" {text}".partition(_TO)
         return cls(process.strip(), to)
+
+    @property
+    def told(self) -> str:
+        """What is to be told of a shard's holder."""
+        if self.process or not self.to:
+            return f"is served by process {self.process or 'unknown'}"
+        return f"was given to process {self.to}"
 
     def __str__(self) -> str:
         """Return it as it is stored while a process serves."""

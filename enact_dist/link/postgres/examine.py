@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 import psycopg
 
 from enact_dist.errors import StoreError
-from enact_dist.link.postgres.address import Holder
+from enact_dist.link.postgres.address import NamedHolder
 from enact_dist.link.postgres.connection import Connector, myself
 from enact_dist.link.postgres.medium import in_one_line, remedy_of
 from enact_dist.link.postgres.tables import COPIES, MISSING, SHARDS, STANDBYS
@@ -105,5 +105,5 @@ def _fill(found: DatabaseReport, session: DatabaseSession, cell: str) -> None:
         standbys[int(shard)] = (*standbys.get(int(shard), ()), who)
     for row_id, name, epoch, batch, holder in session.connection.execute(SHARDS, (cell,)):
         found.shards[name] = ShardRow(
-            Holder.read(holder).process, epoch, batch, standbys.get(row_id, ())
+            NamedHolder.read(holder).process, epoch, batch, standbys.get(row_id, ())
         )
