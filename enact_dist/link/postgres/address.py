@@ -55,7 +55,7 @@ class FreeShard:
 _TO: Final = " > "
 
 
-class HolderText(NamedTuple):
+class NamedHolder(NamedTuple):
     """What `holder` of a shard's row says.
 
     Attributes:
@@ -67,10 +67,17 @@ class HolderText(NamedTuple):
     to: str = ""
 
     @classmethod
-    def read(cls, text: str) -> HolderText:
+    def read(cls, text: str) -> NamedHolder:
         """Read it."""
         process, _, to = f" {text}".partition(_TO)
         return cls(process.strip(), to)
+
+    @property
+    def told(self) -> str:
+        """What is to be told of a shard's holder."""
+        if self.process or not self.to:
+            return f"is served by process {self.process or 'unknown'}"
+        return f"was given to process {self.to}"
 
     def __str__(self) -> str:
         """Return it as it is stored while a process serves."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 import psycopg
 
 from enact_dist.errors import StoreError
-from enact_dist.link.postgres.address import HolderText
+from enact_dist.link.postgres.address import NamedHolder
 from enact_dist.link.postgres.connection import Connector, myself
 from enact_dist.link.postgres.line import RENEW_S
 from enact_dist.link.postgres.medium import in_one_line, remedy_of
@@ -124,6 +124,6 @@ def _fill(found: DatabaseReport, session: DatabaseSession, cell: str) -> None:
         time.sleep(BEAT_S)
     for row in session.connection.execute(SHARDS, (cell,)):
         row_id, name, epoch, batch, _, text = row
-        holder = HolderText.read(text).process
+        holder = NamedHolder.read(text).process
         alive = bool(holder) and row != before.get(row_id)
         found.shards[name] = ShardRow(holder, epoch, batch, standbys.get(row_id, ()), alive)

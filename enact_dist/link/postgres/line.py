@@ -17,7 +17,7 @@ from psycopg import errors
 
 from enact_dist.errors import StoreError
 from enact_dist.link.lease import ShardTakenError
-from enact_dist.link.postgres.address import HolderText
+from enact_dist.link.postgres.address import NamedHolder
 from enact_dist.link.postgres.connection import CONFIRMED, LOST, is_lost
 from enact_dist.link.postgres.tables import COUNT_COPIES, REACHED, RENEW, RESIGN
 
@@ -276,7 +276,7 @@ class Renewer:
                     self._failed(failure)
 
     def _renew(self, session: DatabaseSession) -> None:
-        to = HolderText.read(self._line.confirm(session)).to
+        to = NamedHolder.read(self._line.confirm(session)).to
         if to and self._moves is not None:
             moves, self._moves = self._moves, None
             moves(to)

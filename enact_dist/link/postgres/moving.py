@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 from enact_dist.errors import StoreError
-from enact_dist.link.postgres.address import HolderText
+from enact_dist.link.postgres.address import NamedHolder
 from enact_dist.link.postgres.connection import CONFIRMED, connector_of
 from enact_dist.link.postgres.examine import examine_database
 from enact_dist.link.postgres.medium import database_errors
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from enact_dist.link.postgres.examine import ShardRow
 
 
-class Move(NamedTuple):
+class AskedMove(NamedTuple):
     """A hand-over that was asked for: from which process to which, in which epoch."""
 
     holder: str
@@ -28,7 +28,7 @@ class Move(NamedTuple):
     epoch: int
 
 
-def ask_to_move(address: StoreAddress, host: str) -> Move:
+def ask_to_move(address: StoreAddress, host: str) -> AskedMove:
     """Ask for it.
 
     Args:
@@ -45,7 +45,7 @@ def ask_to_move(address: StoreAddress, host: str) -> Move:
         session = connector_of(address).connect()
         try:
             session.commit_as(CONFIRMED)
-            asked = str(HolderText(row.holder, to))
+            asked = str(NamedHolder(row.holder, to))
             values = (asked, address.cell, address.shard, row.epoch, row.holder)
             if session.row(MOVE, values) is None:
                 raise StoreError(
@@ -54,7 +54,7 @@ def ask_to_move(address: StoreAddress, host: str) -> Move:
                 )
         finally:
             session.close()
-    return Move(row.holder, to, row.epoch)
+    return AskedMove(row.holder, to, row.epoch)
 
 
 def holder_of(address: StoreAddress) -> str:

@@ -11,7 +11,7 @@ import time
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.failover.lease import Standby
-from enact_dist.link.postgres.address import FreeShard, HolderText, ShardHeldError
+from enact_dist.link.postgres.address import FreeShard, NamedHolder, ShardHeldError
 from enact_dist.link.postgres.ahead import ReadAhead
 from enact_dist.link.postgres.connection import LOST, connector_of, myself
 from enact_dist.link.postgres.medium import database_errors, in_one_line
@@ -72,7 +72,7 @@ def wait_free(
                 if patient and ahead is None:
                     ahead = ReadAhead(address)
                 answered = True
-                found = f"{address} is served by process {seen.holder}"
+                found = f"{address} {NamedHolder.read(seen.holder).told}"
                 if watch.alive and not patient:
                     raise ShardHeldError(
                         f"{found}: stop it first (a daemon can stand by for it: `enact shard run"
@@ -107,7 +107,7 @@ def _look(session: DatabaseSession, address: StoreAddress, watch: Standby) -> tu
     shard, seen = look(session, address)
     if time.monotonic() - began_s > address.lease_s / 2:
         watch.was_away()
-    holder = HolderText.read(seen.holder)
+    holder = NamedHolder.read(seen.holder)
     if not holder.process and holder.to == myself():
         seen = seen._replace(holder="")  # given to this process; all others wait for the lease
     return shard, seen
