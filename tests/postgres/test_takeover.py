@@ -160,3 +160,21 @@ def test_commands_say_what_the_database_knows(cell, pair, capsys, monkeypatch):
 
     assert main(["shard", "check", *words]) == 3
     assert "holds it in its database" in capsys.readouterr().out
+
+
+def test_a_takeover_that_the_database_does_not_confirm_ends_when_it_is_told_to(cell, pair):
+    """The database's standby is away: the takeover waits, and says so."""
+    active = cell.start(0)
+    standby = cell.start(1, says=STANDS_BY)
+    pair[1].pause()
+    try:
+        active.kill()
+        deadline_s = time.monotonic() + 30
+        while "is being taken over" not in cell.log(1).read_text():
+            assert time.monotonic() < deadline_s
+            time.sleep(0.1)  # a file tells of no new lines
+        standby.signal(signal.SIGTERM)
+        assert standby.wait_status(10) == 0
+    finally:
+        pair[1].go_on()
+    await_sync(pair[0])

@@ -7,7 +7,7 @@ import os
 import secrets
 import threading
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
@@ -34,7 +34,7 @@ from enact_dist.link.zenoh.service import ZenohService
 from enact_dist.wire.keys import name_in
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Container, Iterable, Mapping
+    from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 
     import zenoh
 
@@ -402,8 +402,11 @@ def take_shard(
         ):
             probes.takes()
             try:
-                shard = RunningShard(settings, certificate, free, session, metrics)
+                with _each_second(waiting, name):
+                    shard = RunningShard(settings, certificate, free, session, metrics)
             except StoreError as error:
+                if stopped.is_set():
+                    return None
                 if not patient:
                     raise
                 _log.warning("shard %s stands by again: %s", name, error)
@@ -412,6 +415,29 @@ def take_shard(
                 undo.pop_all()
                 return shard
     return None
+
+
+@contextmanager
+def _each_second(act: Callable[[], None], name: str) -> Iterator[None]:
+    """Call a function each second: a takeover that reads for long must pass for alive."""
+    over = threading.Event()
+
+    def go_on() -> None:
+        if not over.wait(1.0):
+            text = (
+                "shard %s is being taken over: it is read, or the database has not confirmed that"
+            )
+            _log.info(text, name)
+        while not over.wait(1.0):
+            act()
+
+    thread = threading.Thread(target=go_on, name="enact-takeover", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
 
 
 def formatter_of(settings: DaemonSettings) -> logging.Formatter:

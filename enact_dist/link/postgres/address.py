@@ -10,6 +10,8 @@ from enact_dist.core.failover.lease import HolderRow
 from enact_dist.errors import StoreError
 
 if TYPE_CHECKING:
+    import threading
+
     from enact_dist.link.store.recovery import CheckedRow
 
 LEASE_S_DEFAULT: Final = 2.0
@@ -45,11 +47,13 @@ class FreeShard:
         address: Its place.
         seen: Its row.
         rows: What was read ahead of it, by number.
+        stopped: Breaks the takeover off.
     """
 
     address: StoreAddress
     seen: HolderRow
     rows: dict[int, CheckedRow] = field(default_factory=dict)
+    stopped: threading.Event | None = None
 
 
 _TO: Final = " > "

@@ -235,6 +235,24 @@ def _look_out(of: weakref.ref[Connector], waits: dict[DatabaseSession, float]) -
         del connector
 
 
+@contextmanager
+def broken_off(session: DatabaseSession, stopped: threading.Event | None) -> Iterator[None]:
+    """Let what waits for answers of a session fail once `stopped` is set."""
+    over = threading.Event()
+
+    def watch(stopped: threading.Event) -> None:
+        while not over.wait(LOOK_S):
+            if stopped.is_set():
+                session.break_off()
+
+    if stopped is not None:
+        threading.Thread(target=watch, args=(stopped,), name="enact-store-end", daemon=True).start()
+    try:
+        yield
+    finally:
+        over.set()
+
+
 def _keywords_of(places: Sequence[tuple[str, str]]) -> dict[str, str]:
     """Return how libpq is given hosts and ports; what is not said is left to its defaults."""
     hosts, ports = (",".join(some) for some in zip(*places, strict=True))

@@ -19,7 +19,7 @@ from enact_dist.link.lease import HostLease
 from enact_dist.link.postgres.address import ShardHeldError
 from enact_dist.link.postgres.ahead import RowReader, streamed
 from enact_dist.link.postgres.bodies import ReadBodies
-from enact_dist.link.postgres.connection import CONFIRMED, connector_of, myself
+from enact_dist.link.postgres.connection import CONFIRMED, broken_off, connector_of, myself
 from enact_dist.link.postgres.line import HeldRow, Renewer
 from enact_dist.link.postgres.medium import PostgresMedium, database_errors
 from enact_dist.link.postgres.tables import BODIES, FENCE, ROWS, make_tables, state_of_shard
@@ -77,7 +77,8 @@ def open_database(free: FreeShard, *, unix_s: int) -> tuple[Store, Recovered]:
     with database_errors(name):
         held = take_over(free, unix_s=unix_s)
         try:
-            contents = read_whole(held, name, free.rows)
+            with broken_off(held.session, free.stopped):
+                contents = read_whole(held, name, free.rows)
             store = Store(held.medium, contents, wall_ns=unix_s * 1_000_000_000)
         except BaseException:
             held.medium.close()
@@ -129,7 +130,8 @@ def take_over(free: FreeShard, *, unix_s: int) -> HeldShard:
     try:
         lease = HostLease(address.lease_s)
         sent_s = lease.now_s()
-        shard, epoch, batch = _fence(session, address, unix_s, seen)
+        with broken_off(session, free.stopped):
+            shard, epoch, batch = _fence(session, address, unix_s, seen)
         lease.confirmed(sent_s)
         tenure = HeldRow(connector, shard, epoch, lease, str(address))
         return HeldShard(_medium(session, tenure), session, shard, epoch, batch)

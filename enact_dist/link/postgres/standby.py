@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.core.failover.lease import Standby
 from enact_dist.link.postgres.address import FreeShard, NamedHolder, ShardHeldError
 from enact_dist.link.postgres.ahead import ReadAhead
-from enact_dist.link.postgres.connection import LOST, connector_of, myself
+from enact_dist.link.postgres.connection import LOST, broken_off, connector_of, myself
 from enact_dist.link.postgres.medium import database_errors, in_one_line
 from enact_dist.link.postgres.opening import look
 from enact_dist.link.postgres.tables import NAME_ME, name_of_standby
@@ -62,13 +62,14 @@ def wait_free(
             try:
                 if session is None:
                     session, told = connector.connect(), False
-                with connector.waiting(session):
+                with connector.waiting(session), broken_off(session, stopped):
                     shard, seen = _look(session, address, watch)
                 if not told and seen.holder:
                     told = True
                     session.row(NAME_ME, (name_of_standby(shard, myself()),))
                 if watch.is_free(seen, time.monotonic_ns()):
-                    return FreeShard(address, seen, ahead.stop() if ahead is not None else {})
+                    rows = ahead.stop() if ahead is not None else {}
+                    return FreeShard(address, seen, rows, stopped)
                 if patient and ahead is None:
                     ahead = ReadAhead(address)
                 answered = True
