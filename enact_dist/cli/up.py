@@ -126,6 +126,8 @@ def _refuse_homeless(config: CellConfig, shards: Sequence[ShardConfig], host: st
     """
     from enact_dist.link.zenoh.endpoints import is_of_this_host
 
+    if config.store:
+        return  # each machine may start it: one serves, the others stand by
     hosts = {one.host for one in config.shards} | {one.host for one in config.actors}
     named = sorted(hosts - {""})
     for shard in shards:
@@ -231,7 +233,9 @@ def _task(config: CellConfig, kind: str, name: str, log: str, drain_s: float | N
 
 def _command(config: CellConfig, kind: str, names: tuple[str, ...], log: str) -> tuple[str, ...]:
     command = (sys.executable, "-m", "enact_dist.cli.main", kind, "run", *names)
-    return (*command, "--cell", str(config.path), "--log", log)
+    # Another host may serve the shard, now or when this process is started again.
+    more = ("--standby",) if config.store and kind == "shard" else ()
+    return (*command, "--cell", str(config.path), "--log", log, *more)
 
 
 class _Log:

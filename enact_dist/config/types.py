@@ -49,6 +49,7 @@ LEASE_S_MIN, LEASE_S_MAX = 0.5, 60.0
 DRAIN_S_MAX: Final = 3600.0
 """Default duration of `enact lock hold`."""
 
+_PASSWORD = re.compile(r"([?&]\w*password=)[^&]*")
 _STORE: Final = re.compile(r"postgres(?:ql)?://\S+\Z")
 _ENDPOINT: Final = re.compile(r"(?:tcp|tls)/(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):(\d{1,5})\Z")
 _ADDRESS: Final = re.compile(r"((\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)?:)?\d{1,5}\Z")
@@ -94,10 +95,17 @@ def checked_store(url: str) -> str:
     """
     if not _STORE.match(url):
         raise ValueError(
-            f"{url!r} is no address of a database; write postgresql://user@host/database, with"
-            " several hosts as host1,host2"
+            f"{without_password(url)!r} is no address of a database; write"
+            " postgresql://user@host/database, with several hosts as host1,host2"
         )
     return url
+
+
+def without_password(url: str) -> str:
+    """Return the address of a database for people."""
+    scheme, mark, rest = url.partition("://")
+    who, at, place = rest.rpartition("@")
+    return _PASSWORD.sub(r"\1…", f"{scheme}{mark}{who.partition(':')[0]}{at}{place}")
 
 
 def is_locked(endpoint: str) -> bool:

@@ -6,12 +6,12 @@
 from __future__ import annotations
 
 import logging
-import time
 from typing import TYPE_CHECKING, Final, Protocol
 
 from enact_dist.core.failover.lease import Lease, Silence, kept_ns
 from enact_dist.core.protocol.messages import Refused
 from enact_dist.errors import StoreError
+from enact_dist.link.clock import boottime_ns
 from enact_dist.terms import Durability
 
 if TYPE_CHECKING:
@@ -26,6 +26,10 @@ DATABASE_BODY_BYTES_MAX: Final = 256 << 20
 _log = logging.getLogger("enact.shard")
 
 
+def _now_s() -> float:
+    return boottime_ns() / 1e9
+
+
 class ShardTakenError(StoreError):
     """Another process has the shard: this one must end and answer nothing more."""
 
@@ -35,13 +39,13 @@ class HostLease:
 
     Args:
         lease_s: Its length.
-        now_s: The monotonic clock.
+        now_s: A clock that goes on while the host is suspended.
 
     Attributes:
         usable_s: How long it holds after a write was sent.
     """
 
-    def __init__(self, lease_s: float, now_s: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, lease_s: float, now_s: Callable[[], float] = _now_s) -> None:
         self.lease = Lease(round(lease_s * 1e9))
         self.usable_s = kept_ns(self.lease.lease_ns) / 1e9
         self._now_s = now_s

@@ -42,6 +42,8 @@ FORMATS: Final = ("text", "json")
 TEXT: Final = "%(asctime)s %(levelname)s %(name)s %(message)s"
 READY: Final = "ready:"
 """First word of the line by which a shard or an actor reports that it is ready."""
+STANDS_BY: Final = "standing by"
+"""First words of the line by which a shard reports that another daemon serves it."""
 STDERR: Final = 2
 _FIELDS: Final = "enact_fields"
 """Attribute of a record that holds further fields; all other extra attributes are ignored."""
@@ -145,22 +147,25 @@ def last_words(formatter: logging.Formatter, text: str) -> None:
 
 
 def says_ready(line: str) -> bool:
-    """Whether this line, text or object, reports that a shard or an actor is ready."""
-    return in_words(line).startswith(READY)
+    """Whether this line, text or object, reports that a shard or an actor is ready.
+
+    A shard that stands by counts: another daemon serves.
+    """
+    return in_words(line).startswith((READY, STANDS_BY))
 
 
 def in_words(line: str) -> str:
-    """Return the text of an object that reports that a shard or an actor is ready.
+    """Return the text of an object that reports that a shard or an actor is ready, or stands by.
 
     Any other line is returned unchanged.
     """
-    if not line.startswith("{") or '.ready"' not in line:
+    if not line.startswith("{") or ('.ready"' not in line and '.standby"' not in line):
         return line
     try:
         found = json.loads(line)
     except (ValueError, RecursionError):
         return line
-    ready = found.get("event") in ("shard.ready", "actor.ready")
+    ready = found.get("event") in ("shard.ready", "shard.standby", "actor.ready")
     return str(found.get("text", "")) if ready else line
 
 

@@ -43,14 +43,14 @@ def holders(config: CellConfig) -> Callable[[str], str]:
         if row is None or not (row.holder or row.standbys):
             return "no process holds it in its database, and none stands by"
         stands_by = f", {', '.join(row.standbys)} stands by" if row.standbys else ""
-        return f"process {row.holder or 'none'} holds it in its database{stands_by}"
+        return f"{row.served}, as its database says{stands_by}"
 
     return why
 
 
 def database(config: CellConfig) -> Iterator[Finding]:
     """Check the database of a cell, and who serves each of its shards."""
-    from enact_dist.link.postgres.address import without_password
+    from enact_dist.config.types import without_password
 
     shown = without_password(config.store)
     try:
@@ -76,8 +76,12 @@ def database(config: CellConfig) -> Iterator[Finding]:
         if row is None:
             yield ok(subject, "nothing yet: the shard has never been started")
             continue
-        text = f"epoch {row.epoch}, batch {row.batch}, served by {row.holder or 'no process'}"
-        if row.standbys:
+        text = f"epoch {row.epoch}, batch {row.batch}, {row.served}"
+        if row.holder and not row.alive:
+            yield fail(
+                subject, text, f"start it, or a standby: enact shard run {shard.name} --standby"
+            )
+        elif row.standbys:
             yield ok(subject, f"{text}; {', '.join(row.standbys)} stands by")
         else:
             yield warn(

@@ -70,6 +70,8 @@ def test_actors_start_after_the_shards_are_ready_and_leave_before_them():
         ('{"text": "ready: actor fusion", "event": "actor.ready"}', True),
         ('{"event": "", "text": "ready: says no .ready"}', False),
         ('{"event": "shard.ready", "text": "ready: shar', False),
+        ("standing by for shard left of cell line", True),
+        ('{"event": "shard.standby", "text": "standing by for shard left"}', True),
         ("is it ready: no", False),
     ],
 )

@@ -8,7 +8,7 @@ import pytest
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
 from enact_dist.cli.main import build_parser
-from enact_dist.cli.text.rates import WINDOW_S, Rates, Sample
+from enact_dist.cli.text.rates import WINDOW_S, Rates, Sample, SlotRates
 from enact_dist.core.protocol.datum import Slot
 
 POSE = Aspect("pose_mm", list)
@@ -226,3 +226,11 @@ def test_one_change_has_no_rate():
 
     assert rates.whole()[SLOT].rate_hz is None
     assert rates.whole()[SLOT].bandwidth_bytes_s is None
+
+
+def test_changes_that_are_never_asked_for_do_not_pile_up():
+    rates = SlotRates()
+    for second in range(1000):
+        rates.add(Sample(second * 10**9, 0, 0), float(second))
+    assert len(rates._recent) == WINDOW_S + 1
+    assert rates.whole.changes == 1000

@@ -20,7 +20,7 @@ from enact_dist import Aspect, Entities, Entity, Lock, View, ViewEach, Write, co
 from enact_dist.core.protocol import messages as m
 from enact_dist.errors import ConfigError, EnactError, PermissionDeniedError
 from enact_dist.link.host import ShardHost
-from enact_dist.link.zenoh.access import session_of
+from enact_dist.link.zenoh.access import opens, session_of
 from enact_dist.link.zenoh.tls import KeyFiles, own_certificate, why_refused
 from enact_dist.verify.floods.raw import RawZenoh
 from enact_dist.wire.frames import encode_frame
@@ -254,3 +254,10 @@ def test_act_without_its_right_names_it_and_leaves_nothing(tmp_path, way):
         locked(write(ada, LEFT), write(ada, RIGHT), data=(0, 0))
         with connect(cell.file, actor="arm") as arm:
             assert [what for what in ACTS if not refused(ada, arm, what)] == []
+
+
+def test_secret_of_any_characters_is_compared():
+    session = session_of("ben")
+
+    assert not opens("\N{SNOWMAN}" * 40, session)
+    assert not opens("", session)

@@ -24,11 +24,13 @@ RULES = {
     1: "I1 no two holders",
     2: "I2 each version is built on the one before",
     3: "I3 all or nothing",
+    4: "I4 nothing told is lost",
     5: "I5 what is told is true",
     6: "I6 strict serializability",
     7: "I7 no two believers",
     9: "I9 never committed and aborted",
     10: "I10 prepared keeps its lock",
+    11: "I11 nothing of an epoch that is over",
     12: "I12 nothing is left",
     13: "I13 no waiter is bypassed",
     16: "I16 nothing is executed twice",
@@ -340,6 +342,60 @@ def _standing_locks() -> list[Variant]:
     ]
 
 
+def _takeover() -> list[Variant]:
+    model = "takeover"
+    database, locks = ("CLIENTS=0", "BEATS=2"), ("BATCHES=0", "BEATS=2", "LATE=0")
+    twice = ("CLIENTS=0", "EPOCHS=3", "BEATS=1", "LATE=0")
+    all_well = (*database, "FAULTS=2", "EPOCHS=4")
+    mutants = [
+        ("NO_FENCE", database, 11, "a batch is written whoever has the shard"),
+        ("NO_NUMBER", database, 16, "the fence does not name the batch before"),
+        ("BELIEVES_AT_ONCE", database, 4, "a batch that a new connection shows is confirmed"),
+        ("SERVES_EARLY", database, 6, "a takeover serves before the copy has its epoch"),
+        ("IGNORES_WARNINGS", database, 4, "a commit counts although the database warned"),
+        ("FROM_THE_ANSWER", locks, 7, "a lease counts from when its confirmation came"),
+        ("ANSWERS_UNCHECKED", locks, 7, "answers go out whether the lease holds or not"),
+        ("CHECKS_FIRST", locks, 7, "the lease is checked when a question comes"),
+        ("KEEPS_WHOLE_LEASE", locks, 7, "the holder counts without a margin for drift"),
+        ("WAITS_NO_MARGIN", locks, 7, "the standby waits without a margin for drift"),
+        ("COUNTS_ON", locks, 7, "a standby counts on after it had lost the database"),
+        ("TAKES_BLINDLY", locks, 7, "a takeover does not name the row that was seen"),
+        ("TAKES_ELSEWHERE", locks, 7, "a takeover goes to another primary than the looks"),
+        ("GIVES_BACK_EARLY", locks, 7, "a daemon answers on after it gave its shard back"),
+        ("NO_GRACE", locks, 7, "a daemon that has taken a shard over grants at once"),
+        ("GIVES_UP", all_well, 12, "a standby that came too late looks no more"),
+        ("NEVER_ASKS", all_well, 12, "a daemon does not ask what became of a batch"),
+    ]
+    goals = [
+        (1, database, "a batch that stands is believed after a beat"),
+        (2, database, "a batch that is missing is sent again"),
+        (3, database, "a failover loses a batch"),
+        (4, database, "a takeover comes too late"),
+        (5, database, "a daemon finds that another has the shard"),
+        (6, database, "a lease that was over is renewed in the same epoch"),
+        (7, locks, "the grace ends early: both clients have come"),
+        (8, locks, "the grace ends by time"),
+        (9, locks, "a grant by one daemon while the other does not know yet"),
+        (10, database, "a late batch of an epoch that is over is refused"),
+        (11, database, "a shard that was given back is taken at once"),
+    ]
+    return [
+        Variant(model, "2 daemons, 1 batch, 1 takeover", HOLDS, database),
+        Variant(model, "the same, 2 takeovers, fewer renewals", HOLDS, twice),
+        Variant(model, "2 clients, any number of locks, no batch", HOLDS, locks),
+        Variant(model, "2 clients and 1 batch, fewer renewals", HOLDS, ("BEATS=1", "LATE=0")),
+        Variant(model, "2 faults, then the shard is served", HOLDS, all_well),
+        *(
+            Variant(model, text, BREAKS, (macro, *size), rule)
+            for macro, size, rule, text in mutants
+        ),
+        *(
+            Variant(model, text, REACHES, (f"GOAL={goal}", *size), goal)
+            for goal, size, text in goals
+        ),
+    ]
+
+
 VARIANTS = (
     *_commits(),
     *_grace(),
@@ -348,6 +404,7 @@ VARIANTS = (
     *_kept_grants(),
     *_kept_order(),
     *_standing_locks(),
+    *_takeover(),
 )
 MODELS = tuple(dict.fromkeys(variant.model for variant in VARIANTS))
 

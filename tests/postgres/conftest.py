@@ -42,17 +42,8 @@ def server():
 @pytest.fixture(scope="module")
 def pair():
     """A server and its synchronous standby."""
-    folder = postgres_nodes.make_folder()
-    nodes = [postgres_nodes.Node(folder, name) for name in ("first", "second")]
-    try:
-        nodes[0].init()
-        nodes[0].start()
-        postgres_nodes.replicate(*nodes)
+    with postgres_nodes.two_nodes() as nodes:
         yield nodes
-    finally:
-        for node in reversed(nodes):
-            node.close()
-        shutil.rmtree(folder)
 
 
 @pytest.fixture

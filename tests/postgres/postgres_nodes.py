@@ -7,6 +7,7 @@ import socket
 import subprocess
 import tempfile
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
 USER = "postgres"
@@ -156,3 +157,19 @@ def await_sync(node):
     while node.execute("SELECT 1 FROM pg_stat_replication WHERE sync_state = 'sync'") != [(1,)]:
         assert time.monotonic() < end_s, "no standby has become synchronous"
         time.sleep(0.05)
+
+
+@contextmanager
+def two_nodes():
+    """Give a server and its synchronous standby."""
+    folder = make_folder()
+    nodes = [Node(folder, name) for name in ("first", "second")]
+    try:
+        nodes[0].init()
+        nodes[0].start()
+        replicate(*nodes)
+        yield nodes
+    finally:
+        for node in reversed(nodes):
+            node.close()
+        shutil.rmtree(folder)

@@ -12,7 +12,6 @@ from enact_dist.link.log import READY
 from enact_dist.verify.daemons import LineProcess
 
 SHARD = "left"
-STANDS_BY = "standing by"
 COUNT = Aspect("count", int)
 
 

@@ -1,10 +1,12 @@
 """Which host a store connects to, and what each class of durability asks of the database."""
 
+import postgres_nodes
 import psycopg
 import pytest
 from ports import free_port
 from shard_stores import address_of, state
 
+from enact_dist.config.types import without_password
 from enact_dist.link.postgres.connection import LOST, Connector
 from enact_dist.terms import Durability
 
@@ -25,11 +27,10 @@ def test_the_host_that_answered_last_is_asked_first(server):
     dead = free_port()
     url = f"postgresql://postgres@127.0.0.1:{dead},127.0.0.1:{server.port}/postgres"
     connector = Connector(url, "test")
-    assert connector._ports == [str(dead), str(server.port)]
+    assert [port for _, port in connector._places] == [str(dead), str(server.port)]
     session = connector.connect()
     session.close()
-    assert connector._ports == [str(server.port), str(dead)]
-    assert connector._hosts == ["127.0.0.1", "127.0.0.1"]
+    assert connector._places == (("127.0.0.1", str(server.port)), ("127.0.0.1", str(dead)))
 
 
 def test_nothing_of_ours_cancels_a_wait_for_the_standby(server):
@@ -65,3 +66,29 @@ def test_the_end_of_an_idle_connection_is_no_warning(server):
     session.check()
     with pytest.raises(LOST):
         session.row("SELECT 1")
+
+
+def test_two_names_of_one_server_are_one_host(server):
+    """A wait for the standby is not broken off for the other name."""
+    port = server.port
+    url = f"postgresql://{postgres_nodes.USER}@127.0.0.1:{port},localhost:{port}/postgres"
+    connector = Connector(url, "a test")
+    session = connector.connect()
+    try:
+        assert connector.primary_beside(session) == ""
+    finally:
+        session.close()
+
+
+@pytest.mark.parametrize(
+    ("url", "shown"),
+    [
+        ("postgresql://enact:ge/heim@db1,db2/cell", "postgresql://enact@db1,db2/cell"),
+        ("postgresql://enact:p@ss@db1/cell", "postgresql://enact@db1/cell"),
+        ("postgresql://db1/cell?sslpassword=x&a=b", "postgresql://db1/cell?sslpassword=…&a=b"),
+        ("postgresql://enact@db1/cell?password=x", "postgresql://enact@db1/cell?password=…"),
+        ("postgresql://db1/cell", "postgresql://db1/cell"),
+    ],
+)
+def test_no_password_is_shown(url, shown):
+    assert without_password(url) == shown

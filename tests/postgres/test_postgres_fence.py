@@ -69,11 +69,10 @@ def test_an_old_daemon_writes_nothing(server, stores):
     for body in (b"", bytes(70_000)):
         old, _, medium = stores.open(address)
         old.write([state(1)])
-        epoch, _, holder = row_of(server, address)
-        ((beat,),) = server.execute(
-            "SELECT beat FROM enact.shard WHERE name = %s", (address.shard,)
-        )
         medium._renewer.close()
+        epoch, _, holder = row_of(server, address)
+        found = server.execute("SELECT beat FROM enact.shard WHERE name = %s", (address.shard,))
+        beat = found[0][0]
         free = FreeShard(address, HolderRow(epoch, 0, beat, holder))
         new, recovered = open_database(free, unix_s=1)
         with closing(new):
@@ -167,7 +166,8 @@ def test_a_shard_without_a_sign_is_free_after_the_lease(server, stores):
     assert versions(recovered) == {"a": 1}
 
 
-def test_the_own_batch_that_ended_late_is_not_taken_for_anothers(pair, stores):
+@pytest.mark.parametrize("body", [b"", bytes(200_000)], ids=["small", "large"])
+def test_the_own_batch_that_ended_late_is_not_taken_for_anothers(pair, stores, body):
     """Its connection is lost while it waits for the standby: the next try finds it there."""
     first, second = pair
     with TcpProxy(first.port) as proxy:
@@ -177,7 +177,7 @@ def test_the_own_batch_that_ended_late_is_not_taken_for_anothers(pair, stores):
         medium._renewer.close()
         second.pause()
         try:
-            writer = threading.Thread(target=store.write, args=([state(2)],))
+            writer = threading.Thread(target=store.write, args=([state(2, body=body)],))
             writer.start()
             await_waiting(first)
             proxy.cut()

@@ -7,12 +7,12 @@ import urllib.request
 
 import pytest
 from ports import free_port
-from replicated_cell import SHARD, STANDS_BY, ReplicatedCell
+from replicated_cell import SHARD, ReplicatedCell
 from tcp_proxy import TcpProxy
 
 from enact_dist.config.environment import variable_of
 from enact_dist.link.daemon.metrics import SEES_S
-from enact_dist.link.log import READY
+from enact_dist.link.log import READY, STANDS_BY
 
 DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 UNAVAILABLE = 503

@@ -7,11 +7,11 @@ from contextlib import ExitStack
 
 import pytest
 from postgres_nodes import await_sync
-from replicated_cell import SHARD, STANDS_BY, Counting, ReplicatedCell
+from replicated_cell import SHARD, Counting, ReplicatedCell
 from tcp_proxy import TcpProxy
 
 from enact_dist.cli.main import main
-from enact_dist.link.log import READY
+from enact_dist.link.log import READY, STANDS_BY
 
 pytestmark = pytest.mark.slow
 CLIENTS = 2

@@ -43,9 +43,9 @@ def keeps_no_newer_type(patch: Patch) -> None:
     """A newer type is acknowledged, but no record of it goes to the disk."""
     register = Catalogue.register
 
-    def wrong(self: Catalogue, entry: Any) -> Any:
+    def wrong(self: Catalogue, entry: Any, **how: Any) -> Any:
         before = self.aspects.get(entry.name)
-        answer = register(self, entry)
+        answer = register(self, entry, **how)
         grown = before is not None and before.older != self.aspects[entry.name].older
         return (answer[0], False) if grown else answer
 

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 from enact_dist.cli.target import PROGRAM, cell_target, is_endpoint, open_cell
 from enact_dist.cli.text.output import print_table, shown_bytes
 from enact_dist.cli.verbs import DONE, FAILED, UNREACHABLE, Output
+from enact_dist.config.types import without_password
 from enact_dist.core.state.clock import state_of
-from enact_dist.errors import ConfigError
+from enact_dist.errors import ConfigError, MisuseError, ShardUnreachableError
 from enact_dist.link.daemon.counters import described
 from enact_dist.world.trees import shown_s
 
@@ -46,6 +47,12 @@ def run_shard(options: argparse.Namespace) -> int:
         if found:
             environment[variable_of(options.name, key)] = found
     if options.store:
+        if without_password(options.store) != options.store:
+            raise MisuseError(
+                f"--store {without_password(options.store)}: every user of this host can see the"
+                " password of a command; put the address into ENACT_STORE, or the password into"
+                " ~/.pgpass"
+            )
         environment["ENACT_STORE"] = options.store
 
     def settings() -> DaemonSettings:
@@ -95,7 +102,7 @@ def whole_store(config: CellConfig, folders: Collection[str]) -> StoreAddress:
         ConfigError: Folders are named.
         StoreError: psycopg is not installed.
     """
-    from enact_dist.link.postgres.address import StoreAddress, require_driver, without_password
+    from enact_dist.link.postgres.address import StoreAddress, require_driver
 
     if folders:
         raise ConfigError(
@@ -112,8 +119,6 @@ def refuse_database(config: CellConfig, does: str, remedy: str) -> None:
     Raises:
         ConfigError: They are.
     """
-    from enact_dist.link.postgres.address import without_password
-
     if config.store:
         raise ConfigError(
             f"{config.path}: {does}, and this cell keeps its data in"
@@ -124,13 +129,16 @@ def refuse_database(config: CellConfig, does: str, remedy: str) -> None:
 
 def list_shards(options: argparse.Namespace) -> Output:
     """List all shards, also those that cannot be reached; why, if it is known, on a line each."""
-    with open_cell(options) as cell:
-        shards = cell.shards()
+    try:
+        with open_cell(options) as cell:
+            shards = cell.shards()
+    except ShardUnreachableError:
+        _print_holders(options)
+        raise
     status = DONE if all(shard.reachable for shard in shards) else UNREACHABLE
 
     def problems() -> None:
-        for line in _holders(options):
-            print(f"enact: {line}", file=sys.stderr)
+        _print_holders(options)
         for shard in shards:
             if shard.problem:
                 print(f"enact: shard {shard.name}: {shard.problem}", file=sys.stderr)
@@ -144,18 +152,19 @@ def list_shards(options: argparse.Namespace) -> Output:
     return Output(shards, problems, rows=[*map(_row, shards)], status=status)
 
 
-def _holders(options: argparse.Namespace) -> list[str]:
-    """Return who serves and who stands by, in a cell whose data are in a database."""
+def _print_holders(options: argparse.Namespace) -> None:
+    """Print who serves and who stands by, in a cell whose data are in a database."""
     from enact_dist.config.read import load_config
 
     target = cell_target(options)
     config = None if is_endpoint(target) else load_config(target)
     if config is None or not config.store:
-        return []
+        return
     from enact_dist.operate.doctor_store import holders
 
     held = holders(config)
-    return [f"shard {shard.name}: {held(shard.name)}" for shard in config.shards]
+    for shard in config.shards:
+        print(f"enact: shard {shard.name}: {held(shard.name)}", file=sys.stderr)
 
 
 def _print_counters(shards: Sequence[ShardInfo]) -> None:

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 from enact_dist.cli.target import cell_config
 from enact_dist.cli.text.output import ProgressLine, shown_bytes
 from enact_dist.cli.verbs import Output
+from enact_dist.config.types import without_password
 from enact_dist.errors import ConfigError
-from enact_dist.link.postgres.address import StoreAddress, require_driver, without_password
+from enact_dist.link.postgres.address import StoreAddress, require_driver
 
 if TYPE_CHECKING:
     import argparse

@@ -131,11 +131,15 @@ class SlotRates:
         """Count one more change, received at `now_s`."""
         self.whole.add(sample)
         self._recent.append((now_s, sample))
+        self._forget(now_s)
+
+    def _forget(self, now_s: float) -> None:
+        while self._recent and self._recent[0][0] < now_s - WINDOW_S:
+            self._recent.popleft()
 
     def recent(self, now_s: float) -> Tally:
         """Return the tally of the changes received within the last `WINDOW_S`."""
-        while self._recent and self._recent[0][0] < now_s - WINDOW_S:
-            self._recent.popleft()
+        self._forget(now_s)
         tally = Tally()
         for _, sample in self._recent:
             tally.add(sample)

@@ -232,7 +232,11 @@ def source_of(host: ShardHost, cell: str) -> MetricsSource:
     alive = Pulse(ALIVE_S)
     alive.beat()
     host.each_tick(alive.beat)
-    ready = lambda: bool(host.figures()["ready"])  # noqa: E731 - one of four
+
+    def ready() -> bool:
+        """Whether it grants locks, and its answers go out."""
+        return bool(host.figures()["ready"]) and (host.silence is None or host.silence.holds)
+
     return MetricsSource(lambda: page(host, cell), alive, ready, host.count)
 
 

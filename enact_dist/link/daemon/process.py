@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.errors import EnactError
 from enact_dist.link.daemon.daemon import formatter_of, start_shard, take_shard
 from enact_dist.link.daemon.service_manager import ServiceManager
-from enact_dist.link.log import READY, Log, say
+from enact_dist.link.log import READY, STANDS_BY, Log, say
 from enact_dist.link.signals import StopSignals
 
 if TYPE_CHECKING:
@@ -39,6 +39,7 @@ def run_shard(settings: DaemonSettings) -> int:
     name = settings.shard.name
     manager = ServiceManager()
     formatter = formatter_of(settings)
+    gc.set_threshold(*GC_THRESHOLDS)  # a large shard is read without full collections, too
     with Log(formatter), StopSignals() as signals:
         try:
             shard = _started(settings, signals.event, manager, formatter)
@@ -75,7 +76,7 @@ def _started(
         return start_shard(settings)
     if not settings.standby:
         return take_shard(settings, stopped, lambda: None)
-    text = f"standing by for shard {settings.shard.name} of cell {settings.cell}"
+    text = f"{STANDS_BY} for shard {settings.shard.name} of cell {settings.cell}"
     told = threading.Event()
 
     def waiting() -> None:
@@ -115,4 +116,3 @@ def _stay_responsive() -> None:
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     gc.collect()
     gc.freeze()
-    gc.set_threshold(*GC_THRESHOLDS)

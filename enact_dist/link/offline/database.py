@@ -14,17 +14,19 @@ from typing import TYPE_CHECKING, Final
 import psycopg
 from psycopg.types.numeric import Int8
 
+from enact_dist.config.types import without_password
 from enact_dist.core.offline.forgetting import world_drops
 from enact_dist.core.offline.moving import Shards
 from enact_dist.errors import StoreError
 from enact_dist.link.offline.cell import SILENT, refuse_obstacles, write
 from enact_dist.link.offline.forgetting import planned_purge, refuse_unknown
 from enact_dist.link.offline.rebalance import Rebalance, carry_out, wait_for_leases
-from enact_dist.link.postgres.address import StoreAddress, without_password
+from enact_dist.link.postgres.address import StoreAddress
+from enact_dist.link.postgres.ahead import streamed
 from enact_dist.link.postgres.bodies import BodiesToWrite, ReadBodies
-from enact_dist.link.postgres.connection import CONFIRMED
+from enact_dist.link.postgres.connection import CONFIRMED, connector_of
 from enact_dist.link.postgres.medium import database_errors, send_batch
-from enact_dist.link.postgres.opening import StreamedRows, connector_of, streamed
+from enact_dist.link.postgres.opening import StreamedRows
 from enact_dist.link.postgres.restored import idle_rows, refuse_served, rows_of_cell
 from enact_dist.link.postgres.tables import BODIES, FENCE, MISSING, make_tables
 from enact_dist.link.store.recovery import put_together, read_blobs, read_contents
@@ -124,7 +126,7 @@ def _read(
     session: DatabaseSession, row_id: int, epoch: int, place: str, unix_s: int
 ) -> tuple[Store, Recovered]:
     contents = read_contents(StreamedRows(session, row_id), place)
-    read_blobs(contents, ReadBodies(place, streamed(session, BODIES, row_id)), power_cut=False)
+    read_blobs(contents, ReadBodies(place, streamed(session, BODIES, (row_id,))), power_cut=False)
     put_together(contents, place)
     contents.recovered.epoch = epoch
     medium = _SharedMedium(session, row_id, epoch, place)

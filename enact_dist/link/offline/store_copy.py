@@ -33,19 +33,18 @@ from enact_dist.link.folder.mark import MarkFile
 from enact_dist.link.folder.marks import refuse_moving
 from enact_dist.link.offline.backup import check_bodies, renamed, sync_all
 from enact_dist.link.offline.backup_files import FILE_MODE, FOLDER_MODE, partial_folder
+from enact_dist.link.postgres.ahead import streamed
 from enact_dist.link.postgres.bodies import PART_BYTES
-from enact_dist.link.postgres.connection import CONFIRMED
+from enact_dist.link.postgres.connection import CONFIRMED, connector_of
 from enact_dist.link.postgres.medium import database_errors
 from enact_dist.link.postgres.opening import (
     StreamedRows,
-    connector_of,
     read_rows,
     row_of_shard,
-    streamed,
     take_over,
 )
 from enact_dist.link.postgres.standby import wait_free
-from enact_dist.link.postgres.tables import BODIES, FENCE, FILL, SHARD_ROWS, make_tables
+from enact_dist.link.postgres.tables import BODIES, FENCE, FILL, SHARDS, make_tables
 from enact_dist.link.store.database import Database
 from enact_dist.link.store.medium import folder_errors, read_folder
 from enact_dist.link.store.rows import RowKind
@@ -227,7 +226,7 @@ def _refuse_missing(address: StoreAddress) -> None:
         there = session.row("SELECT to_regclass('enact.shard') IS NOT NULL")
         names = []
         if there == (True,):
-            rows = session.connection.execute(SHARD_ROWS.encode(), (address.cell,))
+            rows = session.connection.execute(SHARDS.encode(), (address.cell,))
             names = [name for _, name, epoch, *_ in rows if epoch]
     if address.shard not in names:
         raise StoreError(
@@ -249,7 +248,7 @@ def _build(held: HeldShard, folder: Path, told: _Told, *, batch: int, unix_s: in
             database.commit(some, (), forced=False)
         database.checkpoint(cut=True)
         _compare(source, database, told, str(folder))
-    with closing(told.parts("copied", streamed(held.session, BODIES, held.shard))) as parts:
+    with closing(told.parts("copied", streamed(held.session, BODIES, (held.shard,)))) as parts:
         _write_bodies(folder / BLOB_FOLDER, parts, held.medium.name)
     store, _ = open_store(folder, unix_s=unix_s)
     with closing(store):
@@ -346,7 +345,7 @@ def _fill(
                 )
             _put(session, shard, folder, source, told)
             _compare(source, StreamedRows(session, shard), told, str(address))
-            with closing(told.parts("compared", streamed(session, BODIES, shard))) as parts:
+            with closing(told.parts("compared", streamed(session, BODIES, (shard,)))) as parts:
                 for _ in parts:
                     pass
             done = told.done(max(told.epoch + 1, unix_s))

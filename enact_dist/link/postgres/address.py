@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import re
-from dataclasses import dataclass
-from typing import Final, NamedTuple
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
 
+from enact_dist.config.types import without_password
 from enact_dist.core.failover.lease import HolderRow
 from enact_dist.errors import StoreError
 
+if TYPE_CHECKING:
+    from enact_dist.link.store.recovery import CheckedRow
+
 LEASE_S_DEFAULT: Final = 2.0
 """How long a shard may answer after its last confirmed write, seconds."""
-_PASSWORD: Final = re.compile(r"(?<=://)([^/@:]*):[^/@]*@|([?&])password=[^&]*")
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,11 +37,19 @@ class StoreAddress:
         return f"{without_password(self.url)} (shard {self.shard} of cell {self.cell})"
 
 
-class FreeShard(NamedTuple):
-    """A shard that no process held when it was last seen."""
+@dataclass(frozen=True, slots=True)
+class FreeShard:
+    """A shard that no process held when it was last seen.
+
+    Attributes:
+        address: Its place.
+        seen: Its row.
+        rows: What was read ahead of it, by number.
+    """
 
     address: StoreAddress
     seen: HolderRow
+    rows: dict[int, CheckedRow] = field(default_factory=dict)
 
 
 class ShardHeldError(StoreError):
@@ -59,8 +69,3 @@ def require_driver(url: str) -> None:
             f"the store {without_password(url)} needs psycopg, which cannot be imported ({error}):"
             " pip install -e '.[postgres]' in the clone of enact-dist"
         ) from error
-
-
-def without_password(url: str) -> str:
-    """Return the URL of a database for people."""
-    return _PASSWORD.sub(lambda found: f"{found[1]}@" if found[1] is not None else "", url)

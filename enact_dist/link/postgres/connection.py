@@ -11,20 +11,27 @@ Rules that a change must keep:
 
 from __future__ import annotations
 
+import logging
 import os
 import socket
-from contextlib import suppress
+import threading
+import time
+import weakref
+from contextlib import contextmanager, nullcontext, suppress
 from typing import TYPE_CHECKING, Any, Final
 
 import psycopg
 from psycopg import errors
 from psycopg.conninfo import conninfo_to_dict
 
+from enact_dist.config.types import without_password
 from enact_dist.errors import StoreError
-from enact_dist.link.postgres.address import without_password
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
+    from contextlib import AbstractContextManager
+
+    from enact_dist.link.postgres.address import StoreAddress
 
 CONNECT_S: Final = 2
 """How long one host may take to answer a connection."""
@@ -51,6 +58,13 @@ LOST: Final = (psycopg.OperationalError, psycopg.InterfaceError, errors.ReadOnly
 """Errors of a connection, of which `is_lost` picks those that a new one may mend."""
 
 
+HUNG_S: Final = 3.0
+"""How long an answer may be away before other hosts are asked whether they take writes."""
+LOOK_S: Final = 0.5
+"""How often that is looked at."""
+_log = logging.getLogger("enact.store")
+
+
 class Connector:
     """Connects to whichever host of a database takes writes, the last good one first.
 
@@ -62,11 +76,14 @@ class Connector:
     def __init__(self, url: str, who: str) -> None:
         self.shown = without_password(url)
         found = conninfo_to_dict(url)
-        self._hosts = str(found.pop("host", "") or "").split(",")
+        hosts = str(found.pop("host", "") or "").split(",")
         ports = str(found.pop("port", "") or "").split(",")
-        self._ports = ports if len(ports) == len(self._hosts) else ports[:1] * len(self._hosts)
+        ports = ports if len(ports) == len(hosts) else ports[:1] * len(hosts)
+        # Several threads connect: it is replaced as a whole, never changed.
+        self._places = tuple(zip(hosts, ports, strict=True))
         options = f"{found.pop('options', '') or ''} {_OPTIONS}".strip()
         self._rest = {**found, **_KEYWORDS, "options": options, "application_name": who}
+        self._lookout = Lookout(self) if len(hosts) > 1 else None
 
     def connect(self) -> DatabaseSession:
         """Connect.
@@ -74,17 +91,35 @@ class Connector:
         Raises:
             psycopg.OperationalError: No host takes writes now.
         """
-        places = {"host": ",".join(self._hosts), "port": ",".join(self._ports)}
-        known = {key: text for key, text in places.items() if text.strip(",")}
-        connection = psycopg.connect(autocommit=True, **{**self._rest, **known})
+        places = self._places
+        connection = psycopg.connect(autocommit=True, **{**self._rest, **_keywords_of(places)})
         connection.prepare_threshold = 0
-        with suppress(ValueError):  # a folder of sockets, or a host that is named otherwise
-            at = list(zip(self._hosts, self._ports, strict=True)).index(
-                (connection.info.host, str(connection.info.port))
-            )
-            for some in (self._hosts, self._ports):
-                some.insert(0, some.pop(at))
+        here = connection.info.host, str(connection.info.port)
+        if here in places:  # else a folder of sockets, or a host that is named otherwise
+            self._places = (here, *(place for place in places if place != here))
         return DatabaseSession(connection)
+
+    def waiting(self, session: DatabaseSession) -> AbstractContextManager[None]:
+        """Return a context in which a session is left whose server hangs."""
+        return self._lookout.over(session) if self._lookout is not None else nullcontext()
+
+    @staticmethod
+    def host_of(session: DatabaseSession) -> str:
+        """Return the host and port of a session."""
+        info = session.connection.info
+        return f"{info.host}:{info.port}"
+
+    def primary_beside(self, session: DatabaseSession) -> str:
+        """Return another host that takes writes, "" if there is none."""
+        for place in self._places:
+            if ":".join(place) == self.host_of(session):
+                continue
+            keywords = {**self._rest, **_keywords_of((place,))}
+            with suppress(psycopg.Error), psycopg.connect(**keywords) as other:
+                # Two names may be those of one server.
+                if _started(other) != session.started:
+                    return ":".join(place)
+        return ""
 
 
 class DatabaseSession:
@@ -92,6 +127,7 @@ class DatabaseSession:
 
     def __init__(self, connection: psycopg.Connection[tuple[Any, ...]]) -> None:
         self.connection = connection
+        self.started = _started(connection)
         self._class = ""
         self._warnings: list[str] = []
         connection.add_notice_handler(self._warned)
@@ -146,6 +182,73 @@ class DatabaseSession:
         """Close the connection; idempotent."""
         with suppress(psycopg.Error):
             self.connection.close()
+
+
+class Lookout:
+    """Leaves a server that hangs once another host takes writes.  It ends with its connector.
+
+    A server whose processes stand still keeps its connections, and its kernel answers for it, so no
+    time-out of the network ends the wait.  A wait for the standby looks the same, and nothing may
+    cut that short: a connection is given up only when another host is the primary.
+
+    Args:
+        connector: Knows the hosts.
+    """
+
+    def __init__(self, connector: Connector) -> None:
+        self._waits: dict[DatabaseSession, float] = {}
+        self._thread = threading.Thread(
+            target=_look_out,
+            args=(weakref.ref(connector), self._waits),
+            name="enact-lookout",
+            daemon=True,
+        )
+        self._thread.start()
+
+    @contextmanager
+    def over(self, session: DatabaseSession) -> Iterator[None]:
+        """Look out while the calling thread waits for answers of a session."""
+        self._waits[session] = time.monotonic()
+        try:
+            yield
+        finally:
+            self._waits.pop(session, None)
+
+
+def _look_out(of: weakref.ref[Connector], waits: dict[DatabaseSession, float]) -> None:
+    while True:
+        time.sleep(LOOK_S)
+        connector = of()
+        if connector is None:
+            return
+        now_s = time.monotonic()
+        for session, since_s in list(waits.items()):
+            if now_s - since_s < HUNG_S:
+                continue
+            found = connector.primary_beside(session)
+            if found and waits.get(session) == since_s:
+                _log.warning(
+                    "%s has not answered for %.1f s, and %s takes writes: going there",
+                    connector.host_of(session), now_s - since_s, found,
+                )  # fmt: skip
+                session.break_off()
+        del connector
+
+
+def _keywords_of(places: Sequence[tuple[str, str]]) -> dict[str, str]:
+    """Return how libpq is given hosts and ports; what is not said is left to its defaults."""
+    hosts, ports = (",".join(some) for some in zip(*places, strict=True))
+    return {key: text for key, text in (("host", hosts), ("port", ports)) if text.strip(",")}
+
+
+def _started(connection: psycopg.Connection[tuple[Any, ...]]) -> object:
+    """Return when a server was started: no two of a database were in the same microsecond."""
+    return connection.execute("SELECT pg_postmaster_start_time()").fetchone()
+
+
+def connector_of(address: StoreAddress) -> Connector:
+    """Return what connects to the database of a shard."""
+    return Connector(address.url, f"enact {address.cell} {address.shard} on {myself()}")
 
 
 def is_lost(failure: Exception, session: DatabaseSession | None) -> bool:

@@ -13,12 +13,15 @@ import psycopg
 
 from enact_dist.errors import StoreError
 from enact_dist.link.postgres.connection import Connector, myself
+from enact_dist.link.postgres.line import RENEW_S
 from enact_dist.link.postgres.medium import in_one_line, remedy_of
 from enact_dist.link.postgres.tables import COPIES, MISSING, SHARDS, STANDBYS
 
 if TYPE_CHECKING:
     from enact_dist.link.postgres.connection import DatabaseSession
 
+BEAT_S: Final = 2.5 * RENEW_S
+"""Within that a holder that lives has renewed its lease."""
 _SYNCHRONOUS: Final = frozenset({"sync", "quorum"})
 
 
@@ -31,12 +34,25 @@ class ShardRow:
         epoch: Its epoch.
         batch: Number of its newest batch.
         standbys: Hosts and processes that stand by for it.
+        alive: Whether the holder renewed its lease while this was looked at.
     """
 
     holder: str
     epoch: int
     batch: int
     standbys: tuple[str, ...] = ()
+    alive: bool = False
+
+    @property
+    def served(self) -> str:
+        """By whom it is served, for people."""
+        if not self.holder:
+            return "served by no process"
+        return (
+            f"served by {self.holder}"
+            if self.alive
+            else f"last served by {self.holder}, which shows no sign of life"
+        )
 
 
 @dataclass(slots=True)
@@ -102,5 +118,10 @@ def _fill(found: DatabaseReport, session: DatabaseSession, cell: str) -> None:
     for text in session.connection.execute(STANDBYS):
         _, shard, who = text[0].split("/", 2)
         standbys[int(shard)] = (*standbys.get(int(shard), ()), who)
-    for row_id, name, epoch, batch, holder in session.connection.execute(SHARDS, (cell,)):
-        found.shards[name] = ShardRow(holder, epoch, batch, standbys.get(row_id, ()))
+    before = {row[0]: row for row in session.connection.execute(SHARDS, (cell,))}
+    if any(row[-1] for row in before.values()):
+        time.sleep(BEAT_S)
+    for row in session.connection.execute(SHARDS, (cell,)):
+        row_id, name, epoch, batch, _, holder = row
+        alive = bool(holder) and row != before.get(row_id)
+        found.shards[name] = ShardRow(holder, epoch, batch, standbys.get(row_id, ()), alive)

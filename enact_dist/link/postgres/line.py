@@ -61,7 +61,7 @@ class Line:
         self._session = session
         self._ending = threading.Event()
         self._ends_s: float | None = None
-        self._breaker: threading.Timer | None = None
+        self._closed = threading.Event()
         self._is_away = False
         self.reconnects = 0
 
@@ -71,13 +71,15 @@ class Line:
             return
         self._ends_s = self._tenure.lease.now_s() + CLOSE_S
         self._ending.set()
-        self._breaker = threading.Timer(CLOSE_S, self._break_off)
-        self._breaker.daemon = True
-        self._breaker.start()
+        threading.Thread(target=self._break_off, name="enact-store-end", daemon=True).start()
 
     def _break_off(self) -> None:
-        if (session := self._session) is not None:
-            session.break_off()
+        """Once time is up, break each wait for an answer off, until the line is closed."""
+        over_s = CLOSE_S
+        while not self._closed.wait(over_s):
+            over_s = AGAIN_S
+            if (session := self._session) is not None:
+                session.break_off()
 
     def again(
         self, act: Callable[[DatabaseSession], None], done: Callable[[DatabaseSession], bool]
@@ -99,12 +101,13 @@ class Line:
             try:
                 session = self._connected()
                 sent_s = tenure.lease.now_s()
-                if uncertain and done(session):
-                    self._confirm(session)
-                else:
-                    uncertain = True
-                    act(session)
-                    session.check()
+                with tenure.connector.waiting(session):
+                    if uncertain and done(session):
+                        self._confirm(session)
+                    else:
+                        uncertain = True
+                        act(session)
+                        session.check()
             except errors.DivisionByZero:
                 # Another has the shard, or an earlier try was committed while this one waited.
                 continue
@@ -142,8 +145,7 @@ class Line:
 
     def close(self) -> None:
         """Close the connection; idempotent."""
-        if self._breaker is not None:
-            self._breaker.cancel()
+        self._closed.set()
         self._drop()
 
     def _drop(self) -> None:
@@ -163,9 +165,23 @@ class Line:
 
     def _connected(self) -> DatabaseSession:
         if self._session is None:
+            if self._over:
+                raise self._ended("a connection was lost")
             self._session = self._tenure.connector.connect()
             self.reconnects += 1
         return self._session
+
+    @property
+    def _over(self) -> bool:
+        """Whether the store ends, and has waited for long enough."""
+        return self._ends_s is not None and self._tenure.lease.now_s() >= self._ends_s
+
+    def _ended(self, why: object) -> StoreError:
+        return StoreError(
+            f"{self._tenure.name} cannot be reached ({why}), and the shard ends: what it has not"
+            " acknowledged may be lost",
+            path=self._tenure.name,
+        )
 
     def _lost(self, failure: Exception) -> None:
         """Give a connection up and pause.
@@ -180,14 +196,10 @@ class Line:
         was_away, self._is_away = self._is_away, True
         if not was_away:
             _log.warning("%s cannot be reached; waiting for it: %s", self._tenure.name, failure)
-        if self._ends_s is not None and self._tenure.lease.now_s() >= self._ends_s:
-            raise StoreError(
-                f"{self._tenure.name} cannot be reached ({failure}), and the shard ends: what it"
-                " has not acknowledged may be lost",
-                path=self._tenure.name,
-            ) from failure
+        if self._over:
+            raise self._ended(failure) from failure
         if was_away:
-            self._ending.wait(AGAIN_S)
+            (self._closed if self._ending.is_set() else self._ending).wait(AGAIN_S)
 
     def _back(self) -> None:
         if self._is_away:

@@ -7,7 +7,8 @@ failover, and no other process writes it.  The lease is renewed while rows are r
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+import threading
+from typing import TYPE_CHECKING, NamedTuple
 
 from psycopg.types.numeric import Int8
 
@@ -16,27 +17,23 @@ from enact_dist.errors import StoreError
 from enact_dist.link.folder.folder import refuse
 from enact_dist.link.lease import HostLease
 from enact_dist.link.postgres.address import ShardHeldError
+from enact_dist.link.postgres.ahead import RowReader, streamed
 from enact_dist.link.postgres.bodies import ReadBodies
-from enact_dist.link.postgres.connection import CONFIRMED, Connector, myself
+from enact_dist.link.postgres.connection import CONFIRMED, connector_of, myself
 from enact_dist.link.postgres.line import HeldRow, Renewer
 from enact_dist.link.postgres.medium import PostgresMedium, database_errors
 from enact_dist.link.postgres.tables import BODIES, FENCE, ROWS, make_tables, state_of_shard
 from enact_dist.link.store.database import DatabaseRow
-from enact_dist.link.store.recovery import put_together, read_blobs, read_contents
+from enact_dist.link.store.recovery import gather, put_together, read_blobs
 from enact_dist.link.store.store import Store
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from enact_dist.core.protocol.records import Recovered
     from enact_dist.link.postgres.address import FreeShard, StoreAddress
     from enact_dist.link.postgres.connection import DatabaseSession
-    from enact_dist.link.store.recovery import Contents
-
-
-def connector_of(address: StoreAddress) -> Connector:
-    """Return what connects to the database of a shard."""
-    return Connector(address.url, f"enact {address.cell} {address.shard} on {myself()}")
+    from enact_dist.link.store.recovery import CheckedRow, Contents
 
 
 def look(session: DatabaseSession, address: StoreAddress) -> tuple[int, HolderRow]:
@@ -80,16 +77,26 @@ def open_database(free: FreeShard, *, unix_s: int) -> tuple[Store, Recovered]:
     with database_errors(name):
         held = take_over(free, unix_s=unix_s)
         try:
-            contents = read_rows(held, name)
-            bodies = ReadBodies(name, streamed(held.session, BODIES, held.shard))
-            read_blobs(contents, bodies, power_cut=False)
-            put_together(contents, name)
-            contents.recovered.epoch = held.epoch
+            contents = read_whole(held, name, free.rows)
             store = Store(held.medium, contents, wall_ns=unix_s * 1_000_000_000)
         except BaseException:
             held.medium.close()
             raise
     return store, contents.recovered
+
+
+def read_whole(held: HeldShard, name: str, ahead: Mapping[int, CheckedRow]) -> Contents:
+    """Read and check a shard with its bodies, but for the rows that were read ahead.
+
+    Raises:
+        As `read_rows`.
+    """
+    contents = read_rows(held, name, ahead)
+    bodies = ReadBodies(name, streamed(held.session, BODIES, (held.shard,)))
+    read_blobs(contents, bodies, power_cut=False)
+    put_together(contents, name)
+    contents.recovered.epoch = held.epoch
+    return contents
 
 
 class HeldShard(NamedTuple):
@@ -117,7 +124,7 @@ def take_over(free: FreeShard, *, unix_s: int) -> HeldShard:
         ShardHeldError: Another process was first, or its holder lives.
         psycopg.Error: As the database reports it.
     """
-    address, seen = free
+    address, seen = free.address, free.seen
     session = (connector := connector_of(address)).connect()
     try:
         lease = HostLease(address.lease_s)
@@ -161,23 +168,21 @@ class StreamedRows:
 
     def rows(self) -> Iterator[DatabaseRow]:
         """Yield all rows, oldest identity first."""
-        yield from map(DatabaseRow._make, streamed(self._session, ROWS, self._shard))
+        yield from map(DatabaseRow._make, streamed(self._session, ROWS, (self._shard,)))
 
 
-def streamed(session: DatabaseSession, statement: str, shard: int) -> Iterator[tuple[Any, ...]]:
-    """Yield what a statement finds of a shard, a few rows at a time."""
-    with session.connection.cursor(binary=True) as cursor:
-        yield from cursor.stream(statement.encode(), (shard,))
-
-
-def read_rows(held: HeldShard, name: str) -> Contents:
-    """Read and check all rows of a shard.
+def read_rows(
+    held: HeldShard, name: str, ahead: Mapping[int, CheckedRow] | None = None
+) -> Contents:
+    """Read and check all rows of a shard, but for those that were read ahead.
 
     Raises:
         StoreError: They are damaged.
         psycopg.Error: As the database reports it.
     """
-    contents = read_contents(StreamedRows(held.session, held.shard), name)
+    rows = dict(ahead or {})
+    RowReader(held.session, held.shard, name, threading.Event()).bring_up(rows)
+    contents = gather((rows[number] for number in sorted(rows)), name)
     if contents.batch != held.batch:
         refuse(name, f"is damaged: its newest row is of batch {contents.batch}, not {held.batch}")
     return contents

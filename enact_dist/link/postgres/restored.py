@@ -11,13 +11,13 @@ import time
 from contextlib import closing
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from enact_dist.config.types import without_password
 from enact_dist.core.failover.lease import HolderRow, Standby
 from enact_dist.errors import StoreError
-from enact_dist.link.postgres.address import without_password
 from enact_dist.link.postgres.connection import CONFIRMED, Connector, myself
 from enact_dist.link.postgres.medium import database_errors
 from enact_dist.link.postgres.standby import LOOK_S
-from enact_dist.link.postgres.tables import CLOCK, MISSING, RAISE, SHARD_ROWS
+from enact_dist.link.postgres.tables import CLOCK, MISSING, RAISE, SHARDS
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -157,7 +157,7 @@ def rows_of_cell(
     Raises:
         StoreError: The database has no such shard.
     """
-    cursor = session.connection.execute(f"{SHARD_ROWS}{more}".encode(), (cell,))
+    cursor = session.connection.execute(f"{SHARDS}{more}".encode(), (cell,))
     all_rows = {row[1]: (row[0], HolderRow(*row[2:])) for row in cursor}
     session.check()
     lacking = [shard for shard in shards if shard not in all_rows]

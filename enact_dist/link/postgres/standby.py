@@ -1,7 +1,8 @@
 """Waits until no other process holds a shard in a database.
 
 A holder changes its row's beat at least every 0.4 s; `core.failover.lease` says when its lease is
-over.  A lost connection, and a look that took long, count as an outage of the database.
+over.  A lost connection, and a look that took long, count as an outage of the database.  A patient
+process reads the shard ahead meanwhile.
 """
 
 from __future__ import annotations
@@ -11,15 +12,17 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.failover.lease import Standby
 from enact_dist.link.postgres.address import FreeShard, ShardHeldError
-from enact_dist.link.postgres.connection import LOST, myself
+from enact_dist.link.postgres.ahead import ReadAhead
+from enact_dist.link.postgres.connection import LOST, connector_of, myself
 from enact_dist.link.postgres.medium import database_errors, in_one_line
-from enact_dist.link.postgres.opening import connector_of, look
+from enact_dist.link.postgres.opening import look
 from enact_dist.link.postgres.tables import NAME_ME, name_of_standby
 
 if TYPE_CHECKING:
     import threading
     from collections.abc import Callable
 
+    from enact_dist.core.failover.lease import HolderRow
     from enact_dist.link.postgres.address import StoreAddress
     from enact_dist.link.postgres.connection import DatabaseSession
 
@@ -51,6 +54,7 @@ def wait_free(
     connector = connector_of(address)
     watch = Standby(round(address.lease_s * 1e9))
     session: DatabaseSession | None = None
+    ahead: ReadAhead | None = None
     noted, told = "", False
     try:
         while not stopped.is_set():
@@ -58,15 +62,15 @@ def wait_free(
             try:
                 if session is None:
                     session, told = connector.connect(), False
-                began_s = time.monotonic()
-                shard, seen = look(session, address)
-                if time.monotonic() - began_s > address.lease_s / 2:
-                    watch.was_away()
+                with connector.waiting(session):
+                    shard, seen = _look(session, address, watch)
                 if not told and seen.holder:
                     told = True
                     session.row(NAME_ME, (name_of_standby(shard, myself()),))
                 if watch.is_free(seen, time.monotonic_ns()):
-                    return FreeShard(address, seen)
+                    return FreeShard(address, seen, ahead.stop() if ahead is not None else {})
+                if patient and ahead is None:
+                    ahead = ReadAhead(address)
                 answered = True
                 found = f"{address} is served by process {seen.holder}"
                 if watch.alive and not patient:
@@ -90,6 +94,17 @@ def wait_free(
             looked(answered)
             stopped.wait(LOOK_S)
     finally:
+        if ahead is not None:
+            ahead.stop()
         if session is not None:
             session.close()
     return None
+
+
+def _look(session: DatabaseSession, address: StoreAddress, watch: Standby) -> tuple[int, HolderRow]:
+    """Return the number of the shard's row, and the row."""
+    began_s = time.monotonic()
+    found = look(session, address)
+    if time.monotonic() - began_s > address.lease_s / 2:
+        watch.was_away()
+    return found

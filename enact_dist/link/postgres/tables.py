@@ -77,21 +77,31 @@ SELECT 1 / count(*) FROM fence
 PUT_BODY: Final = """
 INSERT INTO enact.body SELECT %b, %b, %b + r.part, r.data
 FROM unnest(%b::bytea[]) WITH ORDINALITY AS r(data, part)
+ON CONFLICT DO NOTHING
 """
+"""Names are never used twice, so parts that are there are those of an earlier try."""
 ROWS: Final = """
 SELECT id, kind, batch, key, body, crc FROM enact.record WHERE shard = %b ORDER BY id
+"""
+NEWER: Final = """
+SELECT id, kind, batch, key, body, crc FROM enact.record WHERE shard = %b AND batch > %b
+"""
+LISTED: Final = "SELECT id, batch, crc FROM enact.record WHERE shard = %b"
+THESE: Final = """
+SELECT id, kind, batch, key, body, crc
+FROM unnest(%b::bigint[]) AS wanted(id) JOIN enact.record USING (id) WHERE shard = %b
 """
 BODIES: Final = "SELECT name, data FROM enact.body WHERE shard = %b ORDER BY name, part"
 COPIES: Final = """
 SELECT application_name, sync_state, state FROM pg_stat_replication ORDER BY application_name
 """
-SHARDS: Final = "SELECT id, name, epoch, batch, holder FROM enact.shard WHERE cell = %s"
-SHARD_ROWS: Final = """
+SHARDS: Final = """
 SELECT id, name, epoch, batch, beat, holder FROM enact.shard WHERE cell = %b ORDER BY name
 """
 NAME_ME: Final = "SELECT set_config('application_name', %s, false)"
 STANDBYS: Final = """
-SELECT application_name FROM pg_stat_activity WHERE application_name LIKE 'enact-standby/%/%'
+SELECT application_name FROM pg_stat_activity WHERE datname = current_database()
+    AND application_name ~ '^enact-standby/[0-9]+/'
 ORDER BY backend_start
 """
 

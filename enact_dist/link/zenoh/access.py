@@ -162,7 +162,7 @@ def opens(secret: str, session: str) -> bool:
     """
     if len(session) != SESSION_CHARACTERS:
         return True
-    return secrets.compare_digest(_hash_of(secret), session[:32])
+    return secrets.compare_digest(_hash_of(secret).encode(), session[:32].encode())
 
 
 @lru_cache(maxsize=1024)

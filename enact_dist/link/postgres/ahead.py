@@ -1,0 +1,164 @@
+"""Reads the rows of a shard while another daemon serves it, so that a takeover need not.
+
+Rules that a change must keep:
+
+- Nothing that was read ahead is believed.  At the takeover, after the fence, the database lists the
+  number, batch and checksum of each row, and whatever differs is read then.  So rows that only a
+  lost primary had, and rows that are gone, do no harm.
+- A statement sees whole batches only, so rows of later batches are all there is to read again, as
+  long as the connection lasts.
+- Large bodies are read at the takeover: they are most of the bytes, and least of the time.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from typing import TYPE_CHECKING, Any, Final
+
+import psycopg
+
+from enact_dist.errors import StoreError
+from enact_dist.link.postgres.connection import LOST, connector_of
+from enact_dist.link.postgres.tables import LISTED, NEWER, ROWS, THESE, state_of_shard
+from enact_dist.link.store.database import DatabaseRow
+from enact_dist.link.store.recovery import check_row
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from enact_dist.link.postgres.address import StoreAddress
+    from enact_dist.link.postgres.connection import DatabaseSession
+    from enact_dist.link.store.recovery import CheckedRow
+
+READ_S: Final = 0.25
+"""How often new rows are read."""
+SHARE: Final = 20
+"""A pause is at least this many times as long as what was read before it took."""
+SWEEP_S: Final = 30.0
+"""How often rows that are gone are forgotten; also the pause after damaged rows."""
+_log = logging.getLogger("enact.store")
+
+_AT_ONCE: Final = 500 if psycopg.capabilities.has_stream_chunked() else 1
+"""Rows that the driver hands over in one piece."""
+
+Rows = dict[int, "CheckedRow"]
+"""Rows by number."""
+
+
+class RowReader:
+    """Reads rows of a shard over one connection.
+
+    Args:
+        session: The connection.
+        shard: Number of the shard.
+        name: Its place, for people.
+        stopped: Ends each read, with what was read so far.
+    """
+
+    def __init__(
+        self, session: DatabaseSession, shard: int, name: str, stopped: threading.Event
+    ) -> None:
+        self._session, self._shard = session, shard
+        self._name, self._stopped = name, stopped
+
+    def bring_up(self, rows: Rows) -> int:
+        """Make `rows` those of the database, and read what differs; return the newest batch.
+
+        Raises:
+            StoreError: A row is damaged.
+            psycopg.Error: As the database reports it.
+        """
+        if not rows:
+            return self._read(rows, ROWS, (self._shard,))
+        with self._session.connection.cursor(binary=True) as cursor:
+            listed = cursor.execute(LISTED.encode(), (self._shard,)).fetchall()
+        there = {number: (batch, crc) for number, batch, crc in listed}
+        for number in rows.keys() - there.keys():
+            del rows[number]
+        missing = [
+            number
+            for number, mark in there.items()
+            if (held := rows.get(number)) is None or (held.batch, held.crc) != mark
+        ]
+        self._read(rows, THESE, (missing, self._shard))
+        return max((batch for _, batch, _ in listed), default=0)
+
+    def read_newer(self, rows: Rows, batch: int) -> int:
+        """Read the rows of later batches than this; return the newest batch.
+
+        Raises:
+            As `bring_up`.
+        """
+        return max(batch, self._read(rows, NEWER, (self._shard, batch)))
+
+    def _read(self, rows: Rows, statement: str, values: tuple[Any, ...]) -> int:
+        newest = 0
+        for row in streamed(self._session, statement, values):
+            if self._stopped.is_set():
+                break
+            checked = rows[row[0]] = check_row(DatabaseRow._make(row), self._name)
+            newest = max(newest, checked.batch)
+        return newest
+
+
+def streamed(
+    session: DatabaseSession, statement: str, values: tuple[Any, ...]
+) -> Iterator[tuple[Any, ...]]:
+    """Yield rows as they come, some at a time."""
+    with session.connection.cursor(binary=True) as cursor:
+        yield from cursor.stream(statement.encode(), values, size=_AT_ONCE)
+
+
+class ReadAhead:
+    """Keeps the rows of a shard in memory, on a thread and a connection of its own.
+
+    Args:
+        address: The shard.
+    """
+
+    def __init__(self, address: StoreAddress) -> None:
+        self._address = address
+        self._name = str(address)
+        self._rows: Rows = {}
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._read_on, name="enact-ahead", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> Rows:
+        """End, without waiting for the database, and return the rows read so far."""
+        self._stopped.set()
+        return dict(self._rows)  # in one step: the thread may put another row into its own
+
+    def _read_on(self) -> None:
+        connector, pause_s = connector_of(self._address), 0.0
+        while not self._stopped.wait(pause_s):
+            try:
+                session = connector.connect()
+            except LOST:
+                pause_s = 1.0  # the wait for the shard logs it
+                continue
+            try:
+                self._follow(session)
+            except LOST:
+                pause_s = READ_S
+            except StoreError as damage:
+                _log.warning("rows cannot be read before a takeover: %s", damage)
+                pause_s = SWEEP_S
+            finally:
+                session.close()
+
+    def _follow(self, session: DatabaseSession) -> None:
+        """Read over one connection until this ends, or it."""
+        found = session.row(*state_of_shard(self._address.cell, self._address.shard))
+        shard = found[0] if found is not None else 0
+        reader = RowReader(session, shard, self._name, self._stopped)
+        swept_s, batch, pause_s = 0.0, 0, 0.0
+        while not self._stopped.wait(pause_s):
+            began_s = time.monotonic()
+            if not swept_s or began_s - swept_s > SWEEP_S:
+                batch, swept_s = reader.bring_up(self._rows), began_s
+            else:
+                batch = reader.read_newer(self._rows, batch)
+            pause_s = max(READ_S, SHARE * (time.monotonic() - began_s))

@@ -1,0 +1,120 @@
+"""What a standby serves that read ahead is what a fresh read gives, whatever went on meanwhile."""
+
+import threading
+import time
+from contextlib import closing
+from dataclasses import fields, replace
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from shard_stores import address_of, state, take, versions
+from store_model import State
+from test_store_ledger import BATCHES, at_work
+
+from enact_dist.core.protocol.records import HistoryForgotten, Persist
+from enact_dist.link.postgres import ahead, opening
+from enact_dist.link.postgres.standby import wait_free
+from enact_dist.terms import Durability
+
+GOES_ON = threading.Event()
+"""Never set."""
+
+
+@settings(deadline=None, max_examples=40)
+@given(batches=BATCHES, data=st.data())
+def test_what_was_read_ahead_makes_no_difference(server, batches, data):
+    """Deleted and forgotten rows, labels and causes: after each takeover it is the ledger."""
+    address, expected, rows, batch = address_of(server.url), State(), {}, 0
+    store, _, medium = take(address)
+    try:
+        for persists, restarts in (*batches, ((), True)):
+            for durability, records in persists:
+                for record in records:
+                    written = at_work(record, expected)
+                    expected = expected.after([(durability, [written])])
+                    store.write([Persist(1, (written,), durability)])
+                    session, shard = medium.line._session, medium._tenure.shard
+                    source = ahead.RowReader(session, shard, str(address), GOES_ON)
+                    match data.draw(st.sampled_from(("newer", "all", "nothing"))):
+                        case "newer":
+                            batch = source.read_newer(rows, batch)
+                        case "all":
+                            batch = source.bring_up(rows)
+            if restarts:
+                store.close()
+                store, recovered, medium = take(address, rows=rows)
+                assert not expected.difference(recovered)
+                _same_as_fresh(medium, address, rows)
+    finally:
+        store.close()
+
+
+def _same_as_fresh(medium, address, rows):
+    """Compare all that a store begins with."""
+    session, shard = medium.line._session, medium._tenure.shard
+    seen = opening.look(session, address)[1]
+    held = opening.HeldShard(medium, session, shard, seen.epoch, seen.batch)
+    late, fresh = (opening.read_whole(held, "a test", some) for some in (rows, {}))
+    for one in fields(fresh):
+        if one.name == "states":
+            for name in ("newest", "history", "blobs", "causes", "prepared"):
+                assert getattr(late.states, name) == getattr(fresh.states, name)
+        else:
+            assert getattr(late, one.name) == getattr(fresh, one.name)
+
+
+def test_a_standby_reads_ahead_and_follows(server, stores, stopped):
+    """On its own connection; what it took over is not read again, but for what changed since."""
+    address = address_of(server.url)
+    store, _, _ = stores.open(address)
+    for number in range(50):
+        store.write([state(1, f"e{number}")])
+    noted, found = threading.Event(), []
+
+    def stand_by():
+        arguments = {"patient": True, "note": lambda _: noted.set(), "stopped": stopped}
+        found.append(wait_free(address, **arguments))
+
+    standby = threading.Thread(target=stand_by)
+    standby.start()
+    assert noted.wait(10)
+    _await_sweeps(server, address)
+    store.write([Persist(1, (replace(state(2, "e7").records[0], history=True),), Durability.OS)])
+    forgotten = HistoryForgotten(((state(1, "e7").records[0].slot, 1),))
+    store.write([Persist(1, (forgotten,), Durability.OS), state(1, "late")])
+    store.close()
+    standby.join(20)
+    assert len(found[0].rows) > 50
+
+    store, recovered = opening.open_database(found[0], unix_s=1)
+    with closing(store):
+        assert versions(recovered) == {**{f"e{n}": 1 for n in range(50)}, "e7": 2, "late": 1}
+        assert not recovered.history
+
+
+def _await_sweeps(server, address):
+    """Wait until a standby has read rows and asks for newer ones."""
+    statement = "SELECT 1 FROM pg_stat_activity WHERE query LIKE %s AND application_name = %s"
+    values = ("%AND batch >%", ahead.connector_of(address)._rest["application_name"])
+    end_s = time.monotonic() + 20
+    while not server.execute(statement, values):
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
+
+
+def test_rows_that_only_a_lost_primary_had_are_read_again(server, stores):
+    """They have the number and batch of others; their checksum tells them apart."""
+    address = address_of(server.url)
+    store, _, medium = stores.open(address)
+    store.write([state(1, "a"), state(1, "b")])
+    source = ahead.RowReader(medium.line._session, medium._tenure.shard, str(address), GOES_ON)
+    rows = {}
+    source.bring_up(rows)
+    for number, row in list(rows.items()):
+        rows[number] = row._replace(crc=row.crc ^ 1, holds=rows[min(rows)].holds)
+    rows[10_000] = rows[max(rows)]._replace(id=10_000)
+    store.close()
+
+    store, recovered, _ = take(address, rows=rows)
+    with closing(store):
+        assert versions(recovered) == {"a": 1, "b": 1}
