@@ -268,6 +268,11 @@ def test_the_commands_say_what_they_did(server, tmp_path, capsys, shard_name):
     words = ["left", str(data / "left"), "--cell", str(file)]
     assert main(["shard", "import-store", *words]) == 2
     assert "names no database" in capsys.readouterr().err
+    secret = server.url.replace("postgres@", "postgres:secret@")
+    assert main(["shard", "import-store", *words, "--store", secret]) == 1
+    said = capsys.readouterr().err
+    assert "every user of this host can see the password" in said
+    assert "secret" not in said
 
     assert main(["shard", "import-store", *words, "--store", server.url, "--json"]) == 0
     said = json.loads(capsys.readouterr().out)

@@ -47,12 +47,7 @@ def run_shard(options: argparse.Namespace) -> int:
         if found:
             environment[variable_of(options.name, key)] = found
     if options.store:
-        if without_password(options.store) != options.store:
-            raise MisuseError(
-                f"--store {without_password(options.store)}: every user of this host can see the"
-                " password of a command; put the address into ENACT_STORE, or the password into"
-                " ~/.pgpass"
-            )
+        refuse_password(options.store)
         environment["ENACT_STORE"] = options.store
 
     def settings() -> DaemonSettings:
@@ -86,6 +81,19 @@ def run_shard(options: argparse.Namespace) -> int:
         )
 
     return run_shard_daemon(settings())
+
+
+def refuse_password(url: str) -> None:
+    """Refuse an address of a database that shows its password in a command.
+
+    Raises:
+        MisuseError: It has one.
+    """
+    if without_password(url) != url:
+        raise MisuseError(
+            f"--store {without_password(url)}: every user of this host can see the password of a"
+            " command; put the address into ENACT_STORE, or the password into ~/.pgpass"
+        )
 
 
 def store_of(config: CellConfig, shard: str) -> StoreAddress | None:

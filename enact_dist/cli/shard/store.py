@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING
 
+from enact_dist.cli.shard.shard import refuse_password
 from enact_dist.cli.target import cell_config
 from enact_dist.cli.text.output import ProgressLine, shown_bytes
 from enact_dist.cli.verbs import Output
@@ -124,8 +125,10 @@ def _url(config: CellConfig, named: str | None = None) -> str:
 
     Raises:
         ConfigError: The cell keeps its data elsewhere, and none is named.
+        MisuseError: A password is part of the command.
         StoreError: psycopg is not installed.
     """
+    refuse_password(named or "")
     url = named or config.store
     if not url:
         raise ConfigError(
