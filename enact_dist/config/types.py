@@ -44,7 +44,7 @@ TTL_S_MIN: Final = 0.2
 """Shorter leases end in ordinary scheduling pauses of a loaded machine."""
 TTL_S_MAX: Final = 60.0
 """A dead holder blocks its data for one TTL, a restarted shard waits one for absent sessions."""
-LEASE_S_MIN, LEASE_S_MAX = 0.5, 60.0
+LEASE_S_MIN, LEASE_S_MAX = 1.0, 60.0
 """A shorter lease ends while a host is busy; a standby waits for the whole of a longer one."""
 DRAIN_S_MAX: Final = 3600.0
 """Default duration of `enact lock hold`."""

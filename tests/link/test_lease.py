@@ -21,10 +21,14 @@ class Holding:
         self.lease.confirmed(self.now_s)
         self.holding = self
         self.failed = None
+        self.copies = 1
         self.ends = False
 
     def on_failure(self, failed):
         self.failed = failed
+
+    def on_move(self, moves):
+        self.moves = moves
 
     def end_soon(self):
         self.ends = True

@@ -161,7 +161,7 @@ def test_the_commands_work_on_the_database_of_the_cell(filled, tmp_path, capsys,
     names = [entry.name for entry in placement("left", "right").shards]
     shards = "".join(f'[shards.{n}]\nlisten = "tcp/127.0.0.1:{7440 + len(n)}"\n' for n in names)
     file.write_text(
-        f'name = "{filled.address.cell}"\nstore = "{server.url}"\nlease_s = 0.5\n{shards}'
+        f'name = "{filled.address.cell}"\nstore = "{server.url}"\nlease_s = 1.0\n{shards}'
     )
     assert main(["shard", "rebalance", "--cell", str(file)]) == 0
     assert "every entity is where it belongs" in capsys.readouterr().out

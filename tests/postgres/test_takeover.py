@@ -155,11 +155,11 @@ def test_commands_say_what_the_database_knows(cell, pair, capsys, monkeypatch):
     assert f"store of {SHARD}" in said
     assert "stands by" in said
     assert main(["shard", "ls", *words]) == 0
-    assert "holds it in its database" in capsys.readouterr().err
+    assert "as its database says" in capsys.readouterr().err
     cell.end()
 
     assert main(["shard", "check", *words]) == 3
-    assert "holds it in its database" in capsys.readouterr().out
+    assert "as its database says" in capsys.readouterr().out
 
 
 def test_a_takeover_that_the_database_does_not_confirm_ends_when_it_is_told_to(cell, pair):

@@ -78,7 +78,7 @@ class NamedHolder(NamedTuple):
 
     @property
     def told(self) -> str:
-        """What is to be told of a shard's holder."""
+        """What people read of the holder of a shard."""
         if self.process or not self.to:
             return f"is served by process {self.process or 'unknown'}"
         return f"was given to process {self.to}"
