@@ -13,7 +13,7 @@ from enact_dist.link.postgres.address import FreeShard, ShardHeldError, StoreAdd
 from enact_dist.link.postgres.opening import open_database
 from enact_dist.link.postgres.restored import raise_epochs
 
-LEASE_S = 0.5
+LEASE_S = 1.0
 
 
 @pytest.fixture

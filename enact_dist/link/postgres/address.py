@@ -77,8 +77,8 @@ class NamedHolder(NamedTuple):
         return cls(process.strip(), to)
 
     @property
-    def told(self) -> str:
-        """What people read of the holder of a shard."""
+    def in_words(self) -> str:
+        """Who has the shard, as a message says it."""
         if self.process or not self.to:
             return f"is served by process {self.process or 'unknown'}"
         return f"was given to process {self.to}"

@@ -73,7 +73,7 @@ def wait_free(
                 if patient and ahead is None:
                     ahead = ReadAhead(address)
                 answered = True
-                found = f"{address} {NamedHolder.read(seen.holder).told}"
+                found = f"{address} {NamedHolder.read(seen.holder).in_words}"
                 if watch.alive and not patient:
                     raise ShardHeldError(
                         f"{found}: stop it first (a daemon can stand by for it: `enact shard run"
