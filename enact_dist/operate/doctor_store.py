@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from enact_dist.config.types import without_password
 from enact_dist.errors import StoreError
 from enact_dist.operate.doctor_cell import Finding, fail, ok, warn
 
@@ -50,8 +51,6 @@ def holders(config: CellConfig) -> Callable[[str], str]:
 
 def database(config: CellConfig) -> Iterator[Finding]:
     """Check the database of a cell, and who serves each of its shards."""
-    from enact_dist.config.types import without_password
-
     shown = without_password(config.store)
     try:
         found = database_of(config)

@@ -27,7 +27,7 @@ try:
 except ssl.SSLError as error:
     print(error.reason)
 """
-"""A shard says nothing first, and closes after a second where it took the certificate."""
+"""A shard that accepts the certificate sends nothing, and closes the connection after a second."""
 OWN = 'context.load_cert_chain("/keys/feedback.crt", "/keys/feedback.key")'
 
 

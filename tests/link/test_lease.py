@@ -40,7 +40,9 @@ class Holding:
         pass
 
     def close(self):
-        assert self.ends, "a store that may wait for its database is told before it is closed"
+        assert self.ends, (
+            "the host calls end_soon before it closes a store that may wait for its database"
+        )
 
 
 @pytest.fixture

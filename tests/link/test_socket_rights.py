@@ -121,7 +121,7 @@ def test_a_name_over_zenoh_is_no_proof(tmp_path, monkeypatch):
 
 
 def test_a_name_over_zenoh_ends_nothing_of_that_name(tmp_path):
-    """Whoever takes the name of a client, and the id of its session, from a listing."""
+    """A process that takes a client's name and session id from a listing."""
     with guarded(tmp_path) as (shard, file), connect(file, actor="camera") as camera:
         request = Write(camera.world("online"), Entity("view/1"), COUNT)
         with RawZenoh(load_config(file, environment={})) as raw, Lock(request) as lock:

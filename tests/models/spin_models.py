@@ -348,7 +348,7 @@ def _takeover() -> list[Variant]:
     twice = ("CLIENTS=0", "EPOCHS=3", "BEATS=1", "LATE=0")
     all_well = (*database, "FAULTS=2", "EPOCHS=4")
     mutants = [
-        ("NO_FENCE", database, 11, "a batch is written whoever has the shard"),
+        ("NO_FENCE", database, 11, "a batch is written although another daemon has the shard"),
         ("NO_NUMBER", database, 16, "the fence does not name the batch before"),
         ("BELIEVES_AT_ONCE", database, 4, "a batch that a new connection shows is confirmed"),
         ("SERVES_EARLY", database, 6, "a takeover serves before the copy has its epoch"),

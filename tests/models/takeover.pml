@@ -136,7 +136,7 @@ byte rule;
 #define may_answer(d) (serves(d) && holds(d))
 #endif
 #endif
-#ifdef NO_FENCE                 /* a batch is written whoever has the shard */
+#ifdef NO_FENCE                 /* a batch is written although another daemon has the shard */
 #define fence(e, n) true
 #else
 #ifdef NO_NUMBER                /* the fence does not name the batch before */

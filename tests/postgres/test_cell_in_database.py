@@ -156,7 +156,7 @@ def test_an_aspect_is_forgotten_as_in_folders(filled, server, tmp_path):
 
 
 def test_the_commands_work_on_the_database_of_the_cell(filled, tmp_path, capsys, server):
-    """They list first, and change what they are told to."""
+    """`--dry-run` lists the changes; without it the command makes them."""
     file = tmp_path / "cell.toml"
     names = [entry.name for entry in placement("left", "right").shards]
     shards = "".join(f'[shards.{n}]\nlisten = "tcp/127.0.0.1:{7440 + len(n)}"\n' for n in names)

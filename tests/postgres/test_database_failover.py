@@ -23,6 +23,21 @@ def both(nodes):
     return f"postgresql://{postgres_nodes.USER}@{hosts}/postgres"
 
 
+def failing_write(store):
+    """Begin a write that waits for the standby; return its thread, and where its error will be."""
+    failed = []
+
+    def write():
+        with pytest.raises(StoreError) as found:
+            store.write([state(2)])
+        failed.append(found.value)
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    writer.join(0.3)
+    return writer, failed
+
+
 def test_a_store_goes_on_at_the_promoted_standby(nodes, stores):
     """A commit that was under way is there once; what was acknowledged is there."""
     first, second = nodes
@@ -75,18 +90,9 @@ def test_a_store_ends_in_time_without_an_answer_of_its_database(pair, stores):
     address = address_of(pair[0].url, lease_s=60.0)
     store, _, medium = stores.open(address)
     store.write([state(1)])
-    failed = []
-
-    def write():
-        with pytest.raises(StoreError) as found:
-            store.write([state(2)])
-        failed.append(found.value)
-
     second.pause()
     try:
-        writer = threading.Thread(target=write)
-        writer.start()
-        writer.join(0.3)
+        writer, failed = failing_write(store)
         asked_s = time.monotonic()
         medium.end_soon()
         writer.join(20)
@@ -112,18 +118,9 @@ def test_a_store_that_ends_waits_for_no_second_connection(pair, stores, monkeypa
         return connect()
 
     monkeypatch.setattr(medium._tenure.connector, "connect", slowly)
-    failed = []
-
-    def write():
-        with pytest.raises(StoreError) as found:
-            store.write([state(2)])
-        failed.append(found.value)
-
     second.pause()
     try:
-        writer = threading.Thread(target=write)
-        writer.start()
-        writer.join(0.3)
+        writer, failed = failing_write(store)
         medium.line._session.break_off()
         asked_s = time.monotonic()
         medium.end_soon()

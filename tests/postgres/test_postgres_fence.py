@@ -195,7 +195,7 @@ def test_the_own_batch_that_ended_late_is_not_taken_for_anothers(pair, stores, b
 
 @pytest.mark.parametrize("how", ["pg_cancel_backend", "pg_terminate_backend"])
 def test_a_commit_that_the_standby_has_not_got_is_not_believed(pair, stores, how):
-    """The database calls a cancelled wait a success, and warns; a lost connection says nothing."""
+    """PostgreSQL reports a cancelled wait as success, with a warning; a lost connection gives no answer."""
     first, second = pair
     address = address_of(first.url, lease_s=60.0)
     store, _, medium = stores.open(address)

@@ -53,8 +53,9 @@ def _same_as_fresh(medium, address, rows):
     """Compare all that a store begins with."""
     session, shard = medium.line._session, medium._tenure.shard
     seen = opening.look(session, address)[1]
-    held = opening.HeldShard(medium, session, shard, seen.epoch, seen.batch)
-    late, fresh = (opening.read_whole(held, "a test", some) for some in (rows, {}))
+    late, fresh = (
+        opening.read_whole(session, shard, seen.batch, "a test", some) for some in (rows, {})
+    )
     for one in fields(fresh):
         if one.name == "states":
             for name in ("newest", "history", "blobs", "causes", "prepared"):

@@ -55,7 +55,7 @@ def test_no_seed_loses_doubles_or_invents_an_update():
 
 
 def writes_without_a_fence(patch):
-    """A batch is written whoever has the shard."""
+    """The database writes a batch although another daemon has the shard."""
 
     def putting(self, number, batch, row):
         return daemons.RowChange(row._replace(batch=number, beat=self._beat_after(row)), batch)

@@ -4,8 +4,9 @@ The fence of the database keeps a daemon that has lost its shard from writing.  
 from memory, so it must fall silent by itself, before another daemon can serve.  Rules that a change
 must keep (each has a wrong edit in `tests/sim/test_takeover.py`):
 
-- A lease counts from the *send time* of a batch or renewal that is confirmed, by the holder's own
-  monotonic clock, less the drift of two clocks.  A standby counts more, by its own.
+- A lease counts from the *send time* of a batch or renewal that is confirmed, by a clock of the
+  holder's host that goes on while it is suspended, less the drift of two clocks.  A standby counts
+  more, by a clock of its own.
 - Whatever a connection had under way when it broke may stand or not.  The row of the shard says
   which; that a batch stands is believed only after a later commit is confirmed, since a row that
   only the primary had can be lost with it.
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.records import Effect
 
 DRIFT_PPM: Final = 20_000
-"""How much two monotonic clocks may differ: the holder counts less, a standby counts more."""
+"""How much two clocks may differ: the holder counts less, a standby counts more."""
 OUTAGE_NS: Final = 3_000_000_000
 """How much longer a standby waits after it had lost the database itself."""
 
@@ -55,7 +56,7 @@ class Lease:
     """How long this process may answer for its shard.
 
     Attributes:
-        until_ns: When it ends, on this host's monotonic clock.
+        until_ns: When it ends, on that clock.
     """
 
     __slots__ = ("lease_ns", "until_ns")

@@ -15,9 +15,7 @@ from enact_dist.core.protocol.messages import ListLocks, Locks
 from enact_dist.core.protocol.records import Called, SessionBarred, SessionSeen, ShardReturned
 from enact_dist.errors import ConfigError, LinkError, StoreError
 from enact_dist.link.client.calls import Calls
-from enact_dist.link.client.duplicate_daemons import (
-    Comparing,
-)
+from enact_dist.link.client.duplicate_daemons import Comparing
 from enact_dist.link.daemon.reload import Reload, checked_keys
 from enact_dist.link.daemon.second_daemon import refuse_second_daemon
 from enact_dist.link.daemon.settings import DRAIN_S, DaemonSettings

@@ -22,14 +22,12 @@ from enact_dist.link.offline.cell import SILENT, refuse_obstacles, write
 from enact_dist.link.offline.forgetting import planned_purge, refuse_unknown
 from enact_dist.link.offline.rebalance import Rebalance, carry_out, wait_for_leases
 from enact_dist.link.postgres.address import StoreAddress
-from enact_dist.link.postgres.ahead import streamed
-from enact_dist.link.postgres.bodies import BodiesToWrite, ReadBodies
+from enact_dist.link.postgres.bodies import BodiesToWrite
 from enact_dist.link.postgres.connection import CONFIRMED, connector_of
 from enact_dist.link.postgres.medium import database_errors, send_batch
-from enact_dist.link.postgres.opening import StreamedRows
+from enact_dist.link.postgres.opening import read_whole
 from enact_dist.link.postgres.restored import idle_rows, refuse_served, rows_of_cell
-from enact_dist.link.postgres.tables import BODIES, FENCE, MISSING, make_tables
-from enact_dist.link.store.recovery import put_together, read_blobs, read_contents
+from enact_dist.link.postgres.tables import FENCE, MISSING, make_tables
 from enact_dist.link.store.store import Store
 
 if TYPE_CHECKING:
@@ -114,23 +112,16 @@ def _opened(
                 progress.act(f"open {shard}")
                 session.row(FENCE, (Int8(epoch), "", row_id))
                 place = str(StoreAddress(cell.url, cell.cell, shard))
-                stores[shard], stored[shard] = _read(session, row_id, epoch, place, unix_s)
+                contents = read_whole(session, row_id, row.batch, place)
+                contents.recovered.epoch = epoch
+                medium = _SharedMedium(session, row_id, epoch, place)
+                stores[shard] = Store(medium, contents, wall_ns=unix_s * 1_000_000_000)
+                stored[shard] = contents.recovered
             yield stores, stored
             progress.act("commit")
             if dry_run:
                 raise psycopg.Rollback
         session.check()
-
-
-def _read(
-    session: DatabaseSession, row_id: int, epoch: int, place: str, unix_s: int
-) -> tuple[Store, Recovered]:
-    contents = read_contents(StreamedRows(session, row_id), place)
-    read_blobs(contents, ReadBodies(place, streamed(session, BODIES, (row_id,))), power_cut=False)
-    put_together(contents, place)
-    contents.recovered.epoch = epoch
-    medium = _SharedMedium(session, row_id, epoch, place)
-    return Store(medium, contents, wall_ns=unix_s * 1_000_000_000), contents.recovered
 
 
 def rebalance_database(

@@ -192,7 +192,7 @@ def export_store(
         assert free is not None  # the wait is not stopped
         held = take_over(free, unix_s=unix_s)
         with closing(held.medium):
-            contents = read_rows(held, name)
+            contents = read_rows(held.session, held.shard, held.batch, name)
             told, line = _Told(contents, tell), held.medium.line
             with folder_errors(folder), partial_folder(folder, ".exporting") as partial:
                 _build(held, partial, told, batch=contents.batch, unix_s=unix_s)

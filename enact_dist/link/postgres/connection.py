@@ -28,7 +28,7 @@ from enact_dist.config.types import without_password
 from enact_dist.errors import StoreError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
     from contextlib import AbstractContextManager
 
     from enact_dist.link.postgres.address import StoreAddress
@@ -236,14 +236,16 @@ def _look_out(of: weakref.ref[Connector], waits: dict[DatabaseSession, float]) -
 
 
 @contextmanager
-def broken_off(session: DatabaseSession, stopped: threading.Event | None) -> Iterator[None]:
-    """Let what waits for answers of a session fail once `stopped` is set."""
+def broken_off(
+    session: Callable[[], DatabaseSession | None], stopped: threading.Event | None
+) -> Iterator[None]:
+    """Let what waits for answers of the present session fail once `stopped` is set."""
     over = threading.Event()
 
     def watch(stopped: threading.Event) -> None:
         while not over.wait(LOOK_S):
-            if stopped.is_set():
-                session.break_off()
+            if stopped.is_set() and (waiting := session()) is not None:
+                waiting.break_off()
 
     if stopped is not None:
         threading.Thread(target=watch, args=(stopped,), name="enact-store-end", daemon=True).start()

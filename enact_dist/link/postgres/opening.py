@@ -77,8 +77,9 @@ def open_database(free: FreeShard, *, unix_s: int) -> tuple[Store, Recovered]:
     with database_errors(name):
         held = take_over(free, unix_s=unix_s)
         try:
-            with broken_off(held.session, free.stopped):
-                contents = read_whole(held, name, free.rows)
+            with broken_off(lambda: held.session, free.stopped):
+                contents = read_whole(held.session, held.shard, held.batch, name, free.rows)
+            contents.recovered.epoch = held.epoch
             store = Store(held.medium, contents, wall_ns=unix_s * 1_000_000_000)
         except BaseException:
             held.medium.close()
@@ -86,17 +87,22 @@ def open_database(free: FreeShard, *, unix_s: int) -> tuple[Store, Recovered]:
     return store, contents.recovered
 
 
-def read_whole(held: HeldShard, name: str, ahead: Mapping[int, CheckedRow]) -> Contents:
+def read_whole(
+    session: DatabaseSession,
+    shard: int,
+    batch: int,
+    name: str,
+    ahead: Mapping[int, CheckedRow] | None = None,
+) -> Contents:
     """Read and check a shard with its bodies, but for the rows that were read ahead.
 
     Raises:
         As `read_rows`.
     """
-    contents = read_rows(held, name, ahead)
-    bodies = ReadBodies(name, streamed(held.session, BODIES, (held.shard,)))
+    contents = read_rows(session, shard, batch, name, ahead)
+    bodies = ReadBodies(name, streamed(session, BODIES, (shard,)))
     read_blobs(contents, bodies, power_cut=False)
     put_together(contents, name)
-    contents.recovered.epoch = held.epoch
     return contents
 
 
@@ -130,7 +136,7 @@ def take_over(free: FreeShard, *, unix_s: int) -> HeldShard:
     try:
         lease = HostLease(address.lease_s)
         sent_s = lease.now_s()
-        with broken_off(session, free.stopped):
+        with broken_off(lambda: session, free.stopped):
             shard, epoch, batch = _fence(session, address, unix_s, seen)
         lease.confirmed(sent_s)
         tenure = HeldRow(connector, shard, epoch, lease, str(address))
@@ -174,17 +180,28 @@ class StreamedRows:
 
 
 def read_rows(
-    held: HeldShard, name: str, ahead: Mapping[int, CheckedRow] | None = None
+    session: DatabaseSession,
+    shard: int,
+    batch: int,
+    name: str,
+    ahead: Mapping[int, CheckedRow] | None = None,
 ) -> Contents:
     """Read and check all rows of a shard, but for those that were read ahead.
+
+    Args:
+        session: A connection.
+        shard: Number of the shard.
+        batch: Number of its newest batch.
+        name: Its place, for people.
+        ahead: Rows that are there already, by number.
 
     Raises:
         StoreError: They are damaged.
         psycopg.Error: As the database reports it.
     """
     rows = dict(ahead or {})
-    RowReader(held.session, held.shard, name, threading.Event()).bring_up(rows)
+    RowReader(session, shard, name, threading.Event()).bring_up(rows)
     contents = gather((rows[number] for number in sorted(rows)), name)
-    if contents.batch != held.batch:
-        refuse(name, f"is damaged: its newest row is of batch {contents.batch}, not {held.batch}")
+    if contents.batch != batch:
+        refuse(name, f"is damaged: its newest row is of batch {contents.batch}, not {batch}")
     return contents

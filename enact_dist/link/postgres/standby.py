@@ -8,6 +8,7 @@ process reads the shard ahead meanwhile.
 from __future__ import annotations
 
 import time
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.failover.lease import Standby
@@ -56,13 +57,16 @@ def wait_free(
     session: DatabaseSession | None = None
     ahead: ReadAhead | None = None
     noted, told = "", False
-    try:
+    with ExitStack() as undo:
+        undo.enter_context(broken_off(lambda: session, stopped))
+        undo.callback(lambda: session.close() if session is not None else None)
+        undo.callback(lambda: ahead.stop() if ahead is not None else None)
         while not stopped.is_set():
             answered = False
             try:
                 if session is None:
                     session, told = connector.connect(), False
-                with connector.waiting(session), broken_off(session, stopped):
+                with connector.waiting(session):
                     shard, seen = _look(session, address, watch)
                 if not told and seen.holder:
                     told = True
@@ -94,11 +98,6 @@ def wait_free(
                 noted = found
             looked(answered)
             stopped.wait(LOOK_S)
-    finally:
-        if ahead is not None:
-            ahead.stop()
-        if session is not None:
-            session.close()
     return None
 
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from enact_dist.core.shard.state import ShardSettings
     from enact_dist.verify.simulation.faults import Faults
     from enact_dist.verify.simulation.hosts.world import SimulatedWorld
-    from enact_dist.verify.takeover.database import SimulatedDatabase, Wire
+    from enact_dist.verify.takeover.database import SimulatedDatabase, SimulatedLink
 
 RENEW_NS = 400 * MS
 LOOK_NS = 100 * MS
@@ -47,18 +47,18 @@ class SimulatedLine:
 
     def __init__(self, daemon: SimulatedDaemon) -> None:
         self._daemon = daemon
-        self._connection: Wire | None = None
+        self._connection: SimulatedLink | None = None
         self._act: Callable[[], None] | None = None
         self.breaks = 0
 
-    def connection(self) -> Wire | None:
+    def connection(self) -> SimulatedLink | None:
         """Return an open connection; None: there is none now."""
         if self._connection is None or not self._connection.open:
             daemon = self._daemon
             self._connection = daemon.database.connect(daemon, self._broken)
         return self._connection
 
-    def _broken(self, connection: Wire) -> None:
+    def _broken(self, connection: SimulatedLink) -> None:
         if connection is not self._connection:
             return  # it was noticed before
         self.breaks += 1
@@ -66,7 +66,7 @@ class SimulatedLine:
         if act is not None:
             self._daemon.later(AGAIN_NS, act)
 
-    def attempt(self, again: Callable[[], None]) -> Wire | None:
+    def attempt(self, again: Callable[[], None]) -> SimulatedLink | None:
         """Return a connection for one act; `again` follows if there is none, or if it breaks."""
         connection = self.connection()
         if connection is None:
@@ -237,7 +237,7 @@ class SimulatedDaemon(ShardNode):
             self._lines[0].done()
             self._stands(batch, sent_ns)
 
-    def _ask(self, connection: Wire, batch: tuple[Persist, ...], sent_ns: int) -> None:
+    def _ask(self, connection: SimulatedLink, batch: tuple[Persist, ...], sent_ns: int) -> None:
         """Ask what became of a batch whose answer was lost."""
 
         def seen(row: HolderRow, _persists: tuple[Persist, ...]) -> None:
@@ -253,7 +253,7 @@ class SimulatedDaemon(ShardNode):
 
         self.database.read(connection, seen)
 
-    def believe(self, connection: Wire, batch: tuple[Persist, ...], sent_ns: int) -> None:
+    def believe(self, connection: SimulatedLink, batch: tuple[Persist, ...], sent_ns: int) -> None:
         """Believe that a batch stands once something after it is confirmed."""
         self._beat(connection, partial(self._believed, batch, sent_ns))
 
@@ -273,7 +273,7 @@ class SimulatedDaemon(ShardNode):
             if persist.ticket:
                 self.event(Persisted(persist.ticket))
 
-    def _beat(self, connection: Wire, done: Callable[[StatementDone], None]) -> None:
+    def _beat(self, connection: SimulatedLink, done: Callable[[StatementDone], None]) -> None:
         def beat(row: HolderRow) -> RowChange | None:
             return (
                 RowChange(row._replace(beat=self._beat_after(row)))

@@ -47,7 +47,7 @@ class StatementDone(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class _Write:
-    line: Wire
+    line: SimulatedLink
     make: Callable[[HolderRow], RowChange | None]
     done: Callable[[StatementDone], None]
     position: int = 0
@@ -66,10 +66,12 @@ class Primary:
     busy: _Write | None = None
 
 
-class Wire:
+class SimulatedLink:
     """A connection of a daemon to a primary.  `broken` is called once when it is lost."""
 
-    def __init__(self, primary: Primary, host: Host, broken: Callable[[Wire], None]) -> None:
+    def __init__(
+        self, primary: Primary, host: Host, broken: Callable[[SimulatedLink], None]
+    ) -> None:
         self.primary, self.host, self.open = primary, host, True
         self._broken = broken
 
@@ -90,23 +92,25 @@ class SimulatedDatabase:
             [RowChange(HolderRow(0, 0, 0, ""))], on_standby=1, seen=1
         )
         self._stalled_until_ns = 0
-        self._connections: list[Wire] = []
+        self._connections: list[SimulatedLink] = []
         self._barred: dict[str, int] = {}
         self._deaf: dict[str, int] = {}
         self._standby_lost = False
 
     # ---------------------------------------------------------------- what daemons do
 
-    def connect(self, host: Host, broken: Callable[[Wire], None]) -> Wire | None:
+    def connect(self, host: Host, broken: Callable[[SimulatedLink], None]) -> SimulatedLink | None:
         """Connect to the host that takes writes; None: there is none now."""
         if self.primary is None or self._barred.get(host.name, 0) > self.world.now_ns:
             return None
         self._connections = [line for line in self._connections if line.open]
-        line = Wire(self.primary, host, broken)
+        line = SimulatedLink(self.primary, host, broken)
         self._connections.append(line)
         return line
 
-    def read(self, line: Wire, done: Callable[[HolderRow, tuple[Persist, ...]], None]) -> None:
+    def read(
+        self, line: SimulatedLink, done: Callable[[HolderRow, tuple[Persist, ...]], None]
+    ) -> None:
         """Read the row and all records that can be seen."""
 
         def answer() -> None:
@@ -118,7 +122,7 @@ class SimulatedDatabase:
 
     def write(
         self,
-        line: Wire,
+        line: SimulatedLink,
         make: Callable[[HolderRow], RowChange | None],
         done: Callable[[StatementDone], None],
     ) -> None:
@@ -131,7 +135,7 @@ class SimulatedDatabase:
 
         self._on_way(line, arrive)
 
-    def _on_way(self, line: Wire, act: Callable[[], None]) -> None:
+    def _on_way(self, line: SimulatedLink, act: Callable[[], None]) -> None:
         """Bring a statement to the server: if the line breaks meanwhile, it arrives or not."""
 
         def arrive() -> None:
@@ -140,7 +144,7 @@ class SimulatedDatabase:
 
         self.world.after(self._luck.randrange(MS // 10, 2 * MS), arrive)
 
-    def _answer(self, line: Wire, act: Callable[[], None]) -> None:
+    def _answer(self, line: SimulatedLink, act: Callable[[], None]) -> None:
         def come() -> None:
             if line.open:
                 line.host.receive(lambda: act() if line.open else None)
@@ -227,7 +231,7 @@ class SimulatedDatabase:
         self.cut(host)
         self.world.tally["daemons cut off from the database"] += 1
 
-    def _break(self, line: Wire) -> None:
+    def _break(self, line: SimulatedLink) -> None:
         line.lose()
         write = line.primary.busy
         if write is not None and write.line is line:
