@@ -7,6 +7,7 @@ what catches it is the judge, or the directed test that is named beside it.
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -84,6 +85,22 @@ NAMED = {
 }
 
 
+def takes(new: Any, old: Any) -> bool:
+    """Whether a function may stand for another: the same number by position, no name less."""
+    if not (inspect.isroutine(new) and inspect.isfunction(old)):
+        return True
+    news, olds = (list(inspect.signature(one).parameters.values()) for one in (new, old))
+    kinds, free = {one.kind for one in news}, {one.name for one in news}
+    by_position = [
+        sum(one.kind in {one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD} for one in ones)
+        for ones in (news, olds)
+    ]
+    by_name = {one.name for one in olds if one.kind is one.KEYWORD_ONLY}
+    return (by_position[0] == by_position[1] or inspect.Parameter.VAR_POSITIONAL in kinds) and (
+        by_name <= free or inspect.Parameter.VAR_KEYWORD in kinds
+    )
+
+
 @contextmanager
 def planted(mutant: Mutant) -> Iterator[None]:
     """Run with a wrong edit, and without it afterwards."""
@@ -92,11 +109,14 @@ def planted(mutant: Mutant) -> Iterator[None]:
     def patch(owner: Any, name: str, value: Any) -> None:
         family = getattr(owner, "__mro__", (owner,))
         owner = next((base for base in family if name in vars(base)), owner)
-        undo.append((owner, name, vars(owner)[name]))
+        old = vars(owner)[name]
+        if not takes(value, old):
+            raise TypeError(f"{mutant.__name__} takes other arguments than {owner.__name__}.{name}")
+        undo.append((owner, name, old))
         setattr(owner, name, value)
 
-    mutant(patch)
     try:
+        mutant(patch)
         yield
     finally:
         for owner, name, value in reversed(undo):

@@ -24,8 +24,8 @@ def lets_older_writers_in_after_a_restart(patch: Patch) -> None:
         init(self, **options)
         recovered_by[id(self)] = {entry.name for entry in options["recovered"]}
 
-    def wrong(self: Catalogue, entry: Any) -> Any:
-        answer = register(self, entry)
+    def wrong(self: Catalogue, entry: Any, **how: Any) -> Any:
+        answer = register(self, entry, **how)
         if isinstance(answer, str) and entry.name in recovered_by[id(self)]:
             return self.aspects[entry.name], False
         return answer

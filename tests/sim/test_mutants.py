@@ -8,6 +8,13 @@ from run_mutants import run_directed, simulate
 from test_seeds import KNOWN_BAD
 
 
+@pytest.mark.parametrize("mutant", mutants.ALL, ids=lambda mutant: mutant.__name__)
+def test_mutant_fits_the_core(mutant):
+    """What a run does not draw stands for what is there all the same."""
+    with mutants.planted(mutant):
+        pass
+
+
 @pytest.mark.sampled(35)
 @pytest.mark.parametrize("mutant", mutants.SIMULATED, ids=lambda mutant: mutant.__name__)
 def test_mutant_is_caught(mutant):
