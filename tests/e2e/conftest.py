@@ -71,6 +71,10 @@ class Process:
                 f"ended ({self.popen.wait()}) before it was told {line!r}; {self.story()}"
             ) from None
 
+    @property
+    def pid(self):
+        return self.popen.pid
+
     def signal(self, number):
         self.popen.send_signal(number)
 

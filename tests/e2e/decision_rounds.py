@@ -50,7 +50,7 @@ def must_stand(step, victims):
 
 @dataclass
 class Tally:
-    """What happened in the rounds of one kind; times in seconds after the last shard was ready."""
+    """What happened in the rounds of one kind; times in seconds after `_back`."""
 
     rounds: int = 0
     told: Counter = field(default_factory=Counter)
@@ -91,8 +91,7 @@ class DecisionRounds:
         self._draw = random.Random(seed)
         self._reached = threading.Event()
         self._value = 0
-        for name in cell.ports:
-            start_trapped(cell, name)
+        self._start(cell.ports)
         with contextlib.ExitStack() as stack:
             self._client = stack.enter_context(connect(cell.file, actor="client"))
             self._prober = stack.enter_context(connect(cell.file, actor="prober"))
@@ -120,14 +119,21 @@ class DecisionRounds:
             client.join(TOLD_S)
         elif number % 2:
             client.join(self._draw.uniform(1.0, 2.0) * self.ttl_s)  # away for more than a TTL
-        for name in victims:
-            start_trapped(self.cell, name)
-        back_s = time.monotonic()
+        back_s = self._back(victims)
         value, free_s = self._probe(self._prober)
         self.tally.free_s.append(free_s - back_s)
         client.join(TOLD_S)
         assert not client.is_alive(), f"the client was told nothing; {self._stories()}"
         self._judge(told, value, victims, long_away=long_away)
+
+    def _start(self, names):
+        for name in names:
+            start_trapped(self.cell, name)
+
+    def _back(self, victims):
+        """Let the victims serve again; return the time from which waiting for locks counts."""
+        self._start(victims)
+        return time.monotonic()
 
     def _arm(self, name):
         daemon = self.cell.daemons[name]
@@ -157,7 +163,7 @@ class DecisionRounds:
         daemon = self.cell.daemons[name]
         daemon.expect(f"reached {self.step}")
         self._reached.set()
-        stopped = os.waitid(os.P_PID, daemon.popen.pid, os.WSTOPPED)
+        stopped = os.waitid(os.P_PID, daemon.pid, os.WSTOPPED)
         assert stopped.si_status == signal.SIGSTOP
 
     def _kill(self, victims, armed):
@@ -189,6 +195,8 @@ class DecisionRounds:
         elif told.outcome == "CommitUnknownError":
             assert long_away, f"told unknown after {told.waited_s} s; {self._stories()}"
             assert told.waited_s >= FINISH_S_SHORT
+            found = self._client.outcome(told.error.lock_id, timeout_s=TOLD_S)
+            assert (found is not None) == committed, f"the outcome is {found}; {self._stories()}"
         else:
             assert not committed, f"told {told.error!r}, but visible; {self._stories()}"
         view = View(self._prober.world("online"), LEFT, COUNT)
