@@ -1,7 +1,8 @@
 """Cells for demonstrations: one that runs already, or processes that `enact up` starts.
 
 Rule a change must keep: every process that was started here ends with the demonstration, also when
-that is killed, and such a run starts from an empty data folder of its own.
+that is killed, and such a run starts from an empty data folder of its own; in a database, as a cell
+of a name of its own, which goes with the run.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import contextlib
 import json
 import logging
 import os
+import secrets
 import shutil
 import signal
 import socket
@@ -20,7 +22,7 @@ import threading
 import time
 import tomllib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
 from actors.geometry.files import write_whole
 from enact_dist import connect
@@ -42,10 +44,26 @@ TRY_S: Final = 2.0
 """How long one try to join takes; after each it is looked whether the processes still run."""
 DOWN_S: Final = 20.0
 """How long actors and shards may take to drain."""
+LOOK_S: Final = 0.1
+"""How often the log is looked at."""
+_STORE: Final = "ENACT_STORE"
 
 
 class DemoError(RuntimeError):
     """The demonstration cannot go on; the message says where to look."""
+
+
+class DemoStore(NamedTuple):
+    """A database for the data of a cell, which then has a standby daemon of each shard.
+
+    Attributes:
+        url: Of PostgreSQL; empty: as `ENACT_STORE` says, and if it is not set, the cell has a
+            folder.
+        fail_over_after: Kill the daemons that serve after so many packages; 0: never.
+    """
+
+    url: str = ""
+    fail_over_after: int = 0
 
 
 class DemoCell:
@@ -67,6 +85,15 @@ class DemoCell:
 
     def check(self) -> None:
         """Raise `DemoError` if it is known to be gone."""
+
+    def progressed(self, packages: int) -> str:
+        """Take note that so many packages are done with; return what came of it, for people.
+
+        Raises:
+            DemoError: The demonstration cannot go on.
+        """
+        del packages
+        return ""
 
     def shard_pid(self, name: str) -> int:
         """Return the process of a shard.
@@ -106,6 +133,7 @@ class RunningCell(DemoCell):
         configured: Makes the text of the run's `cell.toml` of the template's text, a data folder
             and a port for each shard.
         env: Environment variables of its processes beside this process's.
+        store: Where its data are instead of a folder.
     """
 
     def __init__(
@@ -116,11 +144,16 @@ class RunningCell(DemoCell):
         template: Path,
         configured: Callable[[str, Path, Sequence[int]], str],
         env: Mapping[str, str] | None = None,
+        store: DemoStore | None = None,
     ) -> None:
         self._log = out / "cell.log"
         super().__init__(out / "cell.toml", log=str(self._log))
+        store = store or DemoStore()
+        self._store = store.url or os.environ.get(_STORE, "")
+        self._fail_over_after = store.fail_over_after
+        self._standbys: dict[str, subprocess.Popen[bytes]] = {}
         self._name, self._template, self._configured = name, template, configured
-        self._env = dict(env or {})
+        self._env = {**(env or {}), **({_STORE: self._store} if self._store else {})}
         self._data = Path()
         self._ports: list[socket.socket] = []
         self._process: subprocess.Popen[bytes] | None = None
@@ -128,32 +161,100 @@ class RunningCell(DemoCell):
     def __enter__(self) -> Self:
         self._data = Path(tempfile.mkdtemp(prefix=f"enact-{self._name}-"))
         template = self._template.read_text()
-        self._ports = kept_ports(len(tomllib.loads(template)["shards"]))
+        count = len(tomllib.loads(template)["shards"])
+        self._ports = kept_ports(2 * count if self._store else count)
         ports = [each.getsockname()[1] for each in self._ports]
-        write_whole({self.config: self._configured(template, self._data, ports).encode()})
-        command = [sys.executable, "-m", "enact_dist.cli.main", "up", str(self.config)]
-        with self._log.open("wb") as log:
-            self._process = subprocess.Popen(
-                command,
+        text = self._configured(template, self._data, ports[:count])
+        if self._store:
+            text = _stored(text, ports[count:])
+        write_whole({self.config: text.encode()})
+        self._log.write_bytes(b"")
+        self._process = self._run("up", str(self.config))
+        return self
+
+    def _run(self, *words: str) -> subprocess.Popen[bytes]:
+        """Start a command, which ends with this process."""
+        with self._log.open("ab") as log:
+            return subprocess.Popen(
+                [sys.executable, "-m", "enact_dist.cli.main", *words],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 env={**os.environ, **self._env, "ENACT_SUPERVISOR_PID": str(os.getpid())},
                 process_group=0,  # Ctrl-C is this process's to pass on
             )
-        return self
 
     def __exit__(self, *_: object) -> None:
-        if self._process is not None:
-            self._process.send_signal(signal.SIGTERM)
-            try:
-                self._process.wait(DOWN_S)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait()
+        for process in (self._process, *self._standbys.values()):
+            if process is not None:
+                _end(process)
         for each in self._ports:
             each.close()
         shutil.rmtree(self._data, ignore_errors=True)
+        if self._store:
+            self._leave_database()
+
+    def _leave_database(self) -> None:
+        """Delete what the cell had in its database."""
+        import psycopg  # of an extra, which only a store needs
+
+        statement = """
+            WITH gone AS (DELETE FROM enact.shard WHERE cell = %s RETURNING id),
+            rows AS (DELETE FROM enact.record USING gone WHERE shard = gone.id)
+            DELETE FROM enact.body USING gone WHERE shard = gone.id"""
+        name = tomllib.loads(self.config.read_text())["name"]
+        try:
+            with psycopg.connect(self._store, connect_timeout=10) as connection:
+                connection.execute(statement, (name,))
+        except psycopg.Error as error:
+            _LOG.warning("the rows of cell %s stay in the database: %s", name, error)
+
+    def joined(self) -> contextlib.AbstractContextManager[Cell]:
+        """Join the cell as soon as its shards answer; their standbys start then.
+
+        Raises:
+            DemoError: As of `DemoCell.joined`, or a standby did not start.
+        """
+        cell = super().joined()
+        try:
+            if self._store and not self._standbys:
+                self._stand_by()
+        except BaseException:
+            with cell:
+                raise
+        return cell
+
+    def _stand_by(self) -> None:
+        """Start a second daemon of each shard; return once all of them stand by."""
+        cell = str(self.config)
+        for name, shard in tomllib.loads(self.config.read_text())["shards"].items():
+            words = ("shard", "run", name, "--standby", "--cell", cell)
+            self._standbys[name] = self._run(*words, "--listen", shard["advertise"][1])
+        deadline_s = time.monotonic() + UP_S
+        while self._log.read_text(errors="replace").count("\nstanding by for shard") < len(
+            self._standbys
+        ):
+            self.check()
+            if time.monotonic() > deadline_s:
+                raise DemoError(f"no standby within {UP_S:.0f} s; see {self._log}")
+            time.sleep(LOOK_S)
+
+    def progressed(self, packages: int) -> str:
+        """Kill the daemon that serves each shard if so many packages are enough, once.
+
+        Raises:
+            DemoError: As of `DemoCell.progressed`, or there are no standbys.
+        """
+        if not self._fail_over_after or packages < self._fail_over_after:
+            return ""
+        self._fail_over_after = 0
+        if not self._standbys or any(each.poll() is not None for each in self._standbys.values()):
+            raise DemoError(f"not every shard has a standby to take over; see {self._log}")
+        killed = {name: self.shard_pid(name) for name in self._standbys}
+        for pid in killed.values():
+            os.kill(pid, signal.SIGKILL)
+        told = ", ".join(f"{name} (process {pid})" for name, pid in killed.items())
+        return f"killed after {packages} packages: shards {told}; their standbys take over"
 
     def shard_pid(self, name: str) -> int:
         """Return the process of a shard, a child of `enact up`.
@@ -195,6 +296,15 @@ class RunningCell(DemoCell):
         if self._process is not None and self._process.poll() is not None:
             lines = self._log.read_text(errors="replace").splitlines()[-8:]
             raise DemoError("\n".join([f"the cell went down; the end of {self.log}:", *lines]))
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.send_signal(signal.SIGTERM)
+    try:
+        process.wait(DOWN_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
 
 
 def until_interrupted(running: DemoCell) -> None:
@@ -275,6 +385,23 @@ def placed(config: dict[str, Any], data: Path, ports: Sequence[int]) -> None:
     config["data_folder"] = str(data)
     for shard, port in zip(config["shards"].values(), ports, strict=True):
         shard["listen"] = f"tcp/127.0.0.1:{port}"
+
+
+def _stored(text: str, ports: Sequence[int]) -> str:
+    """Return a `cell.toml` whose data are in a database, with a second place for each shard.
+
+    Which database is for the environment to say: an address may have a password.
+
+    Args:
+        text: The file of a cell with a data folder.
+        ports: Another one of this host for each shard.
+    """
+    config = tomllib.loads(text)
+    del config["data_folder"]
+    config["name"] += f"-{secrets.token_hex(4)}"
+    for shard, port in zip(config["shards"].values(), ports, strict=True):
+        shard["advertise"] = [shard["listen"], f"tcp/127.0.0.1:{port}"]
+    return toml_of(config)
 
 
 def kept_ports(count: int) -> list[socket.socket]:

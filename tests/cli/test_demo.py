@@ -15,6 +15,8 @@ import pytest
         (("--views", "d", "--keep-running"), "--keep-running belongs to the simulated sensor"),
         (("--cell", "c", "--seed", "3"), "--seed can only be set when the cell is started"),
         (("--cell", "c", "--views", "d"), "--cell watches a cell that runs"),
+        (("--cell", "c", "--fail-over-after", "2"), "--fail-over-after can only be set when the"),
+        (("--fail-over-after", "2"), "--fail-over-after needs a store"),
     ],
 )
 def test_options_that_do_not_fit_are_refused(enact, words, reason):
@@ -23,6 +25,15 @@ def test_options_that_do_not_fit_are_refused(enact, words, reason):
 
     assert result.status == 2
     assert reason in result.err
+
+
+def test_a_password_in_the_command_is_refused(enact):
+    """Every user of the host would see it."""
+    result = enact("demo", "palletizing", "--store", "postgresql://me:secret@db/cell")
+
+    assert result.status == 1
+    assert "can see the password of a command" in result.err
+    assert "secret" not in result.err
 
 
 def test_missing_extra_is_named_with_its_command(enact, monkeypatch):

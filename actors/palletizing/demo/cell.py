@@ -15,6 +15,8 @@ from enact_dist.errors import ConfigError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from actors.running_cell import DemoStore
+
 TEMPLATE: Final = Path(__file__).parents[1] / "cell.toml"
 _SENSORS: Final = "actors.palletizing.simulation.sensors"
 _EYE: Final = "online-perception"
@@ -40,15 +42,20 @@ class RunningCell(running_cell.RunningCell):
         out: Folder for `cell.toml` and `cell.log`.
         packages: How many packages come.
         seed: Seed of all simulated sensors.
+        store: Where its data are instead of a folder.
     """
 
-    def __init__(self, out: Path, *, packages: int, seed: int) -> None:
+    def __init__(
+        self, out: Path, *, packages: int, seed: int, store: DemoStore | None = None
+    ) -> None:
         self.packages, self.seed = packages, seed
 
         def of_this_run(template: str, data: Path, ports: Sequence[int]) -> str:
             return configured(template, packages=packages, seed=seed, data=data, ports=ports)
 
-        super().__init__(out, name="palletizing", template=TEMPLATE, configured=of_this_run)
+        super().__init__(
+            out, name="palletizing", template=TEMPLATE, configured=of_this_run, store=store
+        )
 
 
 def watched_cell(config: Path) -> PalletizingCell:

@@ -71,6 +71,7 @@ if TYPE_CHECKING:
     from actors.palletizing.demo.packing_report import Row
     from actors.palletizing.demo.robot_cell import RobotCell
     from actors.palletizing.vocabulary import Notice, Plan
+    from actors.running_cell import DemoStore
     from enact_dist import Cell
 
     Picture = npt.NDArray[np.uint8]
@@ -92,6 +93,7 @@ def run_packing(
     seed: int = SEED,
     speed: float = SPEED,
     keep_running: bool = False,
+    store: DemoStore | None = None,
 ) -> int:
     """Run the demonstration and report.
 
@@ -101,6 +103,7 @@ def run_packing(
         seed: Seed of packages and sensors.
         speed: Simulated seconds per second; a slow machine does less.
         keep_running: Leave the cell up afterwards, until Ctrl-C.
+        store: Where the cell's data are instead of a folder.
 
     Returns:
         Exit status: 0 done, 1 the cell failed; wrong verdicts are the score's matter.
@@ -112,7 +115,7 @@ def run_packing(
         print(f"--speed is {speed:g}; it must be between 0.1 and 10", file=sys.stderr)
         return 1
     out.mkdir(parents=True, exist_ok=True)
-    running = RunningRobotCell(out, packages=packages, seed=seed, speed=speed)
+    running = RunningRobotCell(out, packages=packages, seed=seed, speed=speed, store=store)
     up = f"cell up: 2 shards, 16 actors, and physics at {speed:g} times real time"
     return show_cell(running, out, up=up, keep_running=keep_running)
 
@@ -218,6 +221,8 @@ def follow(cell: Cell, running: RobotCell | RunningRobotCell, console: Console) 
                         console.print(text)
                     told[place] = text
                 progress.update(packages_bar, completed=len(seen.results))
+                if line := running.progressed(len(seen.results)):
+                    console.print(line)
                 now = views, len(seen.results), "".join(told.values())
                 moved_s, before = (moved_s, before) if now == before else (time.monotonic(), now)
             time.sleep(LOOK_S)

@@ -19,6 +19,8 @@ from enact_dist.errors import ConfigError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from actors.running_cell import DemoStore
+
 TEMPLATE: Final = Path(__file__).parents[1] / "robot_cell.toml"
 HARDWARE_S: Final = 30.0
 """How long the simulated hardware may take to start; it takes a second or two."""
@@ -51,6 +53,7 @@ class RunningRobotCell(running_cell.RunningCell):
         packages: How many packages come.
         seed: Of packages and sensors.
         speed: Simulated seconds per second.
+        store: Where its data are instead of a folder.
 
     Attributes:
         hardware: The simulated hardware, which knows the truth.
@@ -59,7 +62,15 @@ class RunningRobotCell(running_cell.RunningCell):
 
     hardware: RemoteCell
 
-    def __init__(self, out: Path, *, packages: int, seed: int, speed: float) -> None:
+    def __init__(
+        self,
+        out: Path,
+        *,
+        packages: int,
+        seed: int,
+        speed: float,
+        store: DemoStore | None = None,
+    ) -> None:
         self.packages, self._seed, self._speed = packages, seed, speed
         self._hardware_log = out / "hardware.log"
         self._server: subprocess.Popen[bytes] | None = None
@@ -75,7 +86,9 @@ class RunningRobotCell(running_cell.RunningCell):
                 hardware=self._port,
             )
 
-        super().__init__(out, name="packing", template=TEMPLATE, configured=of_this_run)
+        super().__init__(
+            out, name="packing", template=TEMPLATE, configured=of_this_run, store=store
+        )
 
     def __enter__(self) -> Self:
         command = [sys.executable, "-m", "actors.palletizing.simulation.cell.server", "--until-eof"]

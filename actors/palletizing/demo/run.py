@@ -61,6 +61,7 @@ if TYPE_CHECKING:
     from actors.palletizing.demo.report import Row
     from actors.palletizing.simulation.packages import Package
     from actors.palletizing.vocabulary import Notice
+    from actors.running_cell import DemoStore
     from enact_dist import Cell
 
 LOOK_S: Final = 0.2
@@ -71,7 +72,14 @@ SEED: Final = 59
 """A seed whose first twelve packages show every kind of deviation."""
 
 
-def run_demo(*, out: Path, packages: int = 12, seed: int = SEED, keep_running: bool = False) -> int:
+def run_demo(
+    *,
+    out: Path,
+    packages: int = 12,
+    seed: int = SEED,
+    keep_running: bool = False,
+    store: DemoStore | None = None,
+) -> int:
     """Run the demonstration and report.
 
     Args:
@@ -79,6 +87,7 @@ def run_demo(*, out: Path, packages: int = 12, seed: int = SEED, keep_running: b
         packages: How many packages come, at least 1.
         seed: Seed of packages and sensors.
         keep_running: Leave the cell up afterwards, until Ctrl-C.
+        store: Where the cell's data are instead of a folder.
 
     Returns:
         Exit status: 0 done, 1 the cell failed; wrong verdicts are the score's matter.
@@ -88,7 +97,7 @@ def run_demo(*, out: Path, packages: int = 12, seed: int = SEED, keep_running: b
         return 1
     out.mkdir(parents=True, exist_ok=True)
     return _shown(
-        RunningCell(out, packages=packages, seed=seed),
+        RunningCell(out, packages=packages, seed=seed, store=store),
         out,
         up="cell up: 2 shards, 8 actors, each a process",
         keep_running=keep_running,
@@ -174,6 +183,8 @@ def _follow(
                 if place not in told:
                     console.print(notice.text)
             told |= seen.notices.keys()
+            if line := running.progressed(len(told)):
+                console.print(line)
             for product in sorted(seen.models - trained):
                 console.print(f"{product} is trained")
             trained |= seen.models

@@ -77,6 +77,7 @@ VERBS: Final = (
         "palletizing", "a robot packs a tray; actors train models, judge each package and react",
         "palletizing:run_palletizing",
         "enact demo palletizing --packages 6 --seed 1 --speed 1 --out demo\n"
+        "enact demo palletizing --store postgresql://enact@db/cell --fail-over-after 2\n"
         "enact demo palletizing --cell cell.toml --out demo\n"
         "enact demo palletizing --views redwood_rgbd --out surface\n"
         "enact demo palletizing --model milk.pcd --scene table.pcd --out pose\n"
@@ -87,6 +88,12 @@ VERBS: Final = (
             option("--speed", "X", "simulated time per real time (default: 1.25)", type=float),
             _OUT,
             _KEEP_RUNNING,
+            option("--store", "URL",
+                   "keep the data in this PostgreSQL database, with a standby daemon of each shard"
+                   " (default: ENACT_STORE; otherwise a folder)"),
+            counted("--fail-over-after",
+                    "kill the daemons of all shards after so many packages; the standbys take"
+                    " over"),
             file_of("--cell", "FILE",
                     "the cell.toml of a running palletizing cell, to be watched and scored"),
             file_of("--check-net", "FILE",

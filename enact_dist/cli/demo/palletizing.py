@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -9,6 +10,8 @@ from enact_dist.errors import ConfigError
 
 if TYPE_CHECKING:
     import argparse
+
+    from actors.running_cell import DemoStore
 
 _EXTRA: Final = ("open3d", "scipy", "cv2")
 """Modules of the `actors` extra, which the core does without."""
@@ -45,7 +48,30 @@ def _run(options: argparse.Namespace) -> int:
 
     names = ("packages", "seed", "speed")
     given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
-    return run_packing(out=out, keep_running=options.keep_running, **given)
+    store = _store_of(options)
+    return run_packing(out=out, keep_running=options.keep_running, store=store, **given)
+
+
+def _store_of(options: argparse.Namespace) -> DemoStore:
+    """Return where the cell's data are instead of a folder.
+
+    Raises:
+        ConfigError: A takeover is asked for where nothing can take over.
+        MisuseError: The address has a password.
+        StoreError: The driver is missing.
+    """
+    from actors.running_cell import DemoStore
+    from enact_dist.cli.shard.shard import refuse_password
+    from enact_dist.link.postgres.address import require_driver
+
+    url = options.store or os.environ.get("ENACT_STORE", "")
+    if options.store:
+        refuse_password(url)
+    if url:
+        require_driver(url)
+    elif options.fail_over_after:
+        raise ConfigError("--fail-over-after needs a store: say --store URL, or set ENACT_STORE")
+    return DemoStore(url, options.fail_over_after or 0)
 
 
 def _check_net(file: Path, out: Path) -> int:
@@ -66,7 +92,7 @@ def _refuse_mixture(options: argparse.Namespace) -> None:
         raise ConfigError("--views trains, --model and --scene find: run them one after the other")
     simulated = [
         name
-        for name in ("packages", "seed", "speed", "keep_running")
+        for name in ("packages", "seed", "speed", "keep_running", "store", "fail_over_after")
         if getattr(options, name) not in {None, False}
     ]
     option = f"--{simulated[0].replace('_', '-')}" if simulated else ""

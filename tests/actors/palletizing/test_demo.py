@@ -4,6 +4,7 @@ import json
 import re
 import socket
 import subprocess
+import sys
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -26,7 +27,12 @@ from actors.palletizing.feedback import sentence
 from actors.palletizing.simulation.packages import KINDS, package_sequence
 from actors.palletizing.simulation.products import product_mesh
 from actors.palletizing.vocabulary import Deviation, Notice
+from actors.running_cell import DemoStore
 from enact_dist.errors import ConfigError
+
+sys.path.append(str(Path(__file__).parents[2] / "postgres"))
+
+import postgres_nodes
 
 
 def flag(verdict, product="milk_carton"):
@@ -232,6 +238,29 @@ def test_demo_runs_from_training_to_table(tmp_path, capsys):
     for name in ("model_milk_carton.png", "model_meal_tray.png", "tray_1.png"):
         assert (tmp_path / name).stat().st_size > 20_000
     assert "Traceback" not in (tmp_path / "cell.log").read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.timing
+@pytest.mark.sampled(1, of="file")
+def test_verdicts_are_right_through_a_takeover(tmp_path, capsys):
+    """The daemons of both shards are killed in mid-run: their standbys serve, and nothing is lost."""
+    if missing := postgres_nodes.why_missing():
+        pytest.skip(missing)
+    with postgres_nodes.two_nodes() as (node, _):
+        status = run_demo(out=tmp_path, packages=6, store=DemoStore(node.url, 2))
+        left = node.execute("SELECT (SELECT count(*) FROM enact.shard), count(*) FROM enact.record")
+
+    printed = " ".join(capsys.readouterr().out.split())
+    assert status == 0
+    assert "6 of 6 verdicts right" in printed
+    assert "killed after 2 packages: shards left" in printed
+    log = (tmp_path / "cell.log").read_text()
+    assert (
+        re.findall(r"^(?:ready|standing by).* shard (\w+)", log, re.MULTILINE).count("left") == 2
+    ), log
+    assert "Traceback" not in log
+    assert left == [(0, 0)], "rows of the run stay in the database"
 
 
 @pytest.mark.slow
