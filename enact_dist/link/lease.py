@@ -85,6 +85,10 @@ class Holding(Protocol):
     def copies(self) -> int:
         """How many standbys of the database confirm each commit; -1: not visible."""
 
+    @property
+    def waits_s(self) -> float:
+        """How long the database has not taken now what it was sent, seconds."""
+
     def on_failure(self, failed: Callable[[Exception], None]) -> None:
         """Call `failed`, once, when the lease cannot be renewed any more."""
 
@@ -124,10 +128,11 @@ class AnswerGate:
     def figures(self) -> dict[str, float]:
         """Return current values, by name."""
         since_ns = self._silence.since_ns
+        silent_s = (self._lease.now_ns() - since_ns) / 1e9 if since_ns else 0.0
         return {
             "store_copies": self._holding.copies,
             "lease_left_s": max(0.0, self._lease.left_s),
-            "store_stalled_s": (self._lease.now_ns() - since_ns) / 1e9 if since_ns else 0.0,
+            "store_stalled_s": max(silent_s, self._holding.waits_s),
         }
 
     def rounded(self) -> dict[str, int]:

@@ -22,6 +22,7 @@ class Holding:
         self.holding = self
         self.failed = None
         self.copies = 1
+        self.waits_s = 0.0
         self.ends = False
 
     def on_failure(self, failed):

@@ -51,12 +51,16 @@ def why_missing():
 class Node:
     """One server.
 
+    Args:
+        before: A command that ends by running its programs, such as `nsenter`.
+
     Attributes:
         port: Where it listens.
     """
 
-    def __init__(self, folder, name):
+    def __init__(self, folder, name, *, before=()):
         self.name = name
+        self._before = before
         self.data = Path(folder) / name
         self._kept = socket.socket()  # the port stays this server's while it is down
         self._kept.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -64,15 +68,15 @@ class Node:
         self.port = self._kept.getsockname()[1]
         self.url = f"postgresql://{USER}@127.0.0.1:{self.port}/postgres"
 
-    def init(self):
+    def init(self, *words):
         """Make an empty database."""
-        as_user("initdb", "-D", self.data, "-U", USER, "-A", "trust", "-E", "UTF8", "--no-sync", "--locale=C.UTF-8")  # fmt: skip
+        self._run("initdb", "-D", self.data, "-U", USER, "-A", "trust", "-E", "UTF8", "--no-sync", "--locale=C.UTF-8", *words)  # fmt: skip
         with (self.data / "postgresql.conf").open("a") as file:
             file.write(SETTINGS)
 
     def copy(self, other):
         """Begin as a standby of another node."""
-        as_user("pg_basebackup", "-h", "127.0.0.1", "-p", other.port, "-U", USER, "-D", self.data, "-R", "-X", "stream", "-C", "-S", self.name, "--no-sync", "-c", "fast")  # fmt: skip
+        self._run("pg_basebackup", "-h", "127.0.0.1", "-p", other.port, "-U", USER, "-D", self.data, "-R", "-X", "stream", "-C", "-S", self.name, "--no-sync", "-c", "fast")  # fmt: skip
         file = self.data / "postgresql.auto.conf"
         text = file.read_text()
         found = text.replace(
@@ -81,17 +85,17 @@ class Node:
         file.write_text(found)
 
     def start(self):
-        as_user("pg_ctl", "-D", self.data, "-o", f"-p {self.port}", "-l", self.data / "log", "-w", "start")  # fmt: skip
+        self._run("pg_ctl", "-D", self.data, "-o", f"-p {self.port}", "-l", self.data / "log", "-w", "start")  # fmt: skip
 
     def stop(self, how="immediate"):
-        as_user("pg_ctl", "-D", self.data, "-m", how, "-w", "stop", check=False)
+        self._run("pg_ctl", "-D", self.data, "-m", how, "-w", "stop", check=False)
 
     def restart(self):
         self.stop("fast")
         self.start()
 
     def promote(self):
-        as_user("pg_ctl", "-D", self.data, "-w", "promote")
+        self._run("pg_ctl", "-D", self.data, "-w", "promote")
 
     def pids(self):
         """Return the processes of this server, its postmaster first."""
@@ -108,6 +112,10 @@ class Node:
         for pid in self.pids():
             os.kill(pid, signal.SIGCONT)
 
+    def log(self):
+        """Return what the server has said."""
+        return (self.data / "log").read_text()
+
     def execute(self, statement, values=()):
         """Execute a statement on a connection of its own; return the rows."""
         import psycopg
@@ -116,17 +124,20 @@ class Node:
             cursor = connection.execute(statement, values)
             return cursor.fetchall() if cursor.description else []
 
+    def _run(self, program, *words, check=True):
+        as_user(program, *words, check=check, before=self._before)
+
     def close(self):
         if (self.data / "postmaster.pid").exists():
             self.stop()
         self._kept.close()
 
 
-def as_user(program, *words, check=True):
+def as_user(program, *words, check=True, before=()):
     """Run a program of the server, which refuses root, as its own user."""
     command = [str(programs() / program), *map(str, words)]
     if os.geteuid() == 0:
-        command = ["runuser", "-u", USER, "--", *command]
+        command = [*before, "runuser", "-u", USER, "--", *command]
     done = subprocess.run(
         command, check=False, text=True, cwd="/", stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, timeout=60,

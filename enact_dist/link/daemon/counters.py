@@ -161,7 +161,7 @@ OF_A_SHARD: Final[dict[str, Figure]] = {
         " folders"
     ),
     "store_stalled_s": _gauge(
-        "seconds that answers have waited now, since the database confirms nothing",
+        "seconds that answers or commits have waited now for the database",
         "look at the database and the way to it: enact doctor",
     ),
     "takeovers": Figure(

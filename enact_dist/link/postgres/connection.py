@@ -54,6 +54,8 @@ RECEIVED: Final = "remote_write"
 """Of what the system of the other host has got; less than that is lost with a failover."""
 _LAST_WORDS: Final = frozenset({"FATAL", "PANIC"})
 """What an idle connection gets as a notice when the server ends it."""
+_PASSES: Final = (errors.LockNotAvailable, errors.ReadOnlySqlTransaction, errors.DiskFull)
+"""Errors after which the connection stands, and nothing was written."""
 LOST: Final = (psycopg.OperationalError, psycopg.InterfaceError, errors.ReadOnlySqlTransaction)
 """Errors of a connection, of which `is_lost` picks those that a new one may mend."""
 
@@ -271,9 +273,15 @@ def connector_of(address: StoreAddress) -> Connector:
     return Connector(address.url, f"enact {address.cell} {address.shard} on {myself()}")
 
 
+def in_one_line(failure: Exception) -> str:
+    """Return what an error says, without line breaks and a question at its end."""
+    text = " ".join(str(failure).split()) or type(failure).__name__
+    return text.replace(" Is the server running on that host and accepting TCP/IP connections?", "")
+
+
 def is_lost(failure: Exception, session: DatabaseSession | None) -> bool:
-    """Whether a new connection may mend an error: it was lost, or another one held the row."""
-    if isinstance(failure, errors.LockNotAvailable | errors.ReadOnlySqlTransaction):
+    """Whether a later try may do: the connection was lost, the row was held, or a disk was full."""
+    if isinstance(failure, _PASSES):
         return True
     connection = session.connection if session is not None else None
     return connection is None or connection.closed or connection.broken

@@ -13,9 +13,9 @@ import psycopg
 
 from enact_dist.errors import StoreError
 from enact_dist.link.postgres.address import NamedHolder
-from enact_dist.link.postgres.connection import Connector, myself
+from enact_dist.link.postgres.connection import Connector, in_one_line, myself
 from enact_dist.link.postgres.line import RENEW_S
-from enact_dist.link.postgres.medium import in_one_line, remedy_of
+from enact_dist.link.postgres.medium import remedy_of
 from enact_dist.link.postgres.tables import COPIES, MISSING, SHARDS, STANDBYS
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from psycopg import errors
 from enact_dist.errors import StoreError
 from enact_dist.link.lease import ShardTakenError
 from enact_dist.link.postgres.address import NamedHolder
-from enact_dist.link.postgres.connection import CONFIRMED, LOST, is_lost
+from enact_dist.link.postgres.connection import CONFIRMED, LOST, in_one_line, is_lost
 from enact_dist.link.postgres.tables import COUNT_COPIES, REACHED, RENEW, RESIGN
 
 if TYPE_CHECKING:
@@ -35,6 +35,8 @@ COPIES_S: Final = 5.0
 """How often the database's copies are counted."""
 AGAIN_S: Final = 0.1
 """Pause before another try to connect."""
+FULL_S: Final = 1.0
+"""Pause before another try to write to a disk that was full."""
 CLOSE_S: Final = 1.0
 """How long a closing store still tries to reach its database."""
 _log = logging.getLogger("enact.store")
@@ -48,6 +50,18 @@ class HeldRow(NamedTuple):
     epoch: int
     lease: HostLease
     name: str
+
+
+class Trouble(NamedTuple):
+    """Why a line waits.
+
+    Attributes:
+        since_s: Since when, on the clock of the lease.
+        full: Whether a disk of the database is full; otherwise, it is not reached.
+    """
+
+    since_s: float
+    full: bool
 
 
 class Line:
@@ -67,8 +81,14 @@ class Line:
         self._ending = threading.Event()
         self._ends_s: float | None = None
         self._closed = threading.Event()
-        self._is_away = False
+        self._trouble: Trouble | None = None
         self.reconnects = 0
+
+    @property
+    def waits_s(self) -> float:
+        """How long the database has not taken now what it was sent, seconds."""
+        trouble = self._trouble
+        return self._tenure.lease.now_s() - trouble.since_s if trouble is not None else 0.0
 
     def end_soon(self) -> None:
         """Let an act without an answer fail after `CLOSE_S`; from any thread; idempotent."""
@@ -197,18 +217,23 @@ class Line:
         if not is_lost(failure, self._session):
             raise failure
         self._drop()
-        was_away, self._is_away = self._is_away, True
-        if not was_away:
-            _log.warning("%s cannot be reached; waiting for it: %s", self._tenure.name, failure)
+        before, full = self._trouble, isinstance(failure, errors.DiskFull)
+        if before is None or full != before.full:
+            since_s = before.since_s if before is not None else self._tenure.lease.now_s()
+            self._trouble = Trouble(since_s, full)
+            what = "has no room: free some" if full else "cannot be reached"
+            _log.warning("%s %s; waiting for it: %s", self._tenure.name, what, in_one_line(failure))
         if self._over:
             raise self._ended(failure) from failure
-        if was_away:
-            (self._closed if self._ending.is_set() else self._ending).wait(AGAIN_S)
+        if before is not None or full:
+            pause_s = FULL_S if full else AGAIN_S
+            (self._closed if self._ending.is_set() else self._ending).wait(pause_s)
 
     def _back(self) -> None:
-        if self._is_away:
-            self._is_away = False
-            _log.warning("%s is reached again", self._tenure.name)
+        if (trouble := self._trouble) is not None:
+            self._trouble = None
+            what = "has room again" if trouble.full else "is reached again"
+            _log.warning("%s %s", self._tenure.name, what)
 
 
 class Renewer:

@@ -17,7 +17,7 @@ from psycopg.types.numeric import Int8
 from enact_dist.core.failover.lease import BrokenBatch, after_break
 from enact_dist.errors import StoreError
 from enact_dist.link.postgres.bodies import PART_BYTES, BodiesToWrite
-from enact_dist.link.postgres.connection import CONFIRMED, RECEIVED
+from enact_dist.link.postgres.connection import CONFIRMED, RECEIVED, in_one_line
 from enact_dist.link.postgres.line import Line
 from enact_dist.link.postgres.tables import PUT_BODY, WRITE
 
@@ -98,6 +98,11 @@ class PostgresMedium:
         """See `Renewer`."""
         return self._renewer.copies
 
+    @property
+    def waits_s(self) -> float:
+        """See `Line`."""
+        return self.line.waits_s
+
     def end_soon(self) -> None:
         """Let whatever cannot reach the database fail soon; from any thread."""
         self.line.end_soon()
@@ -177,12 +182,6 @@ def database_errors(name: str) -> Iterator[None]:
             " data are kept",
             path=name,
         ) from failure
-
-
-def in_one_line(failure: psycopg.Error) -> str:
-    """Return what an error says, without line breaks and a question at its end."""
-    text = " ".join(str(failure).split()) or type(failure).__name__
-    return text.replace(" Is the server running on that host and accepting TCP/IP connections?", "")
 
 
 def remedy_of(failure: psycopg.Error) -> str:

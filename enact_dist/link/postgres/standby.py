@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.core.failover.lease import Standby
 from enact_dist.link.postgres.address import FreeShard, NamedHolder, ShardHeldError
 from enact_dist.link.postgres.ahead import ReadAhead
-from enact_dist.link.postgres.connection import LOST, broken_off, connector_of, myself
-from enact_dist.link.postgres.medium import database_errors, in_one_line
+from enact_dist.link.postgres.connection import LOST, broken_off, connector_of, in_one_line, myself
+from enact_dist.link.postgres.medium import database_errors
 from enact_dist.link.postgres.opening import look
 from enact_dist.link.postgres.tables import NAME_ME, name_of_standby
 
