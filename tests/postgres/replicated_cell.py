@@ -106,6 +106,16 @@ class Counting:
             assert time.monotonic() < end_s, f"no update for {timeout_s} s: {self.errors[-3:]}"
             time.sleep(0.01)
 
+    def next_update(self, timeout_s):
+        """Return after how long the next update was acknowledged, but for the one under way."""
+        asked_s = time.monotonic()
+        first_s = self.await_after(asked_s, timeout_s)
+        return first_s + self.await_after(asked_s + first_s, timeout_s)
+
+    def stop(self):
+        """End without a look at what was counted."""
+        self._ends.set()
+
     def end(self):
         """End, and check: each acknowledged update counts once, and no other but unknown ones."""
         self._ends.set()
