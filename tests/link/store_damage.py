@@ -6,6 +6,8 @@ from enact_dist.errors import StoreError
 from enact_dist.link.folder import mark as store_mark
 from enact_dist.link.store.store import open_store
 
+CHANGED_ROWS = ("batch = batch + 1", "kind = 3", "kind = 99", "body = 'text'", "key = 'text'")
+"""What was set in one row by hand, as SQL, in a folder's database or in one of the cell."""
 FRAME_BYTES = 24 + 4096
 LOG_HEADER_BYTES = 32
 

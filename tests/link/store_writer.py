@@ -1,7 +1,7 @@
 """Records to store, what a store holds, and a writer process that can be killed.
 
-As a program: ``python store_writer.py FOLDER`` forks a writer for each seed read from its input.
-A writer opens the store, prints ``ready PID``, then writes through a store thread as fast as it
+As a program: ``python store_writer.py FOLDER`` forks a writer for each seed read from its input;
+``python store_writer.py URL SHARD`` writes to a database.  A writer opens the store, prints ``ready PID``, then writes through a store thread as fast as it
 goes and prints one line ``GROUP VERSION`` per kept batch; when it was killed, ``ended`` follows.
 Each `Persist` sets all slots of a group, one of them large, and the group's outcome to one version.
 """
@@ -24,6 +24,8 @@ GROUPS = 3
 SMALL_SLOTS = 4
 LARGE_BYTES = 70_000
 IN_FLIGHT = 8
+KILLED_LEASE_S = 0.3
+"""Of a shard in a database whose writers are killed; the next one waits for its end."""
 
 
 def body_of(name, version, size):
@@ -122,10 +124,10 @@ def fill(folder, version, *, unix_s=1):
     return found.epoch
 
 
-def write_until_killed(folder, seed):
+def write_until_killed(opened, seed):
     """Write and report until this process ends."""
     rng = random.Random(seed)
-    store, recovered = open_store(folder, unix_s=1)
+    store, recovered = opened()[:2]
     versions = group_versions(recovered)
     free = threading.Semaphore(IN_FLIGHT)
 
@@ -144,15 +146,25 @@ def write_until_killed(folder, seed):
         thread.submit(group_persist(group, versions[group], durability=durability))
 
 
-def write_again_and_again(folder):
+def write_again_and_again(opened):
     """Fork a writer for each seed of the input and wait for its end."""
     for seed in sys.stdin:
         writer = os.fork()
         if not writer:
-            write_until_killed(folder, int(seed))
+            write_until_killed(opened, int(seed))
         os.waitpid(writer, 0)
         os.write(1, b"ended\n")
 
 
+def opener(place, *shard):
+    """Return what opens the store of a folder, or of a shard in a database."""
+    if not shard:
+        return lambda: open_store(Path(place), unix_s=1)
+    sys.path.append(str(Path(__file__).parents[1] / "postgres"))
+    from shard_stores import address_of, take
+
+    return lambda: take(address_of(place, *shard, lease_s=KILLED_LEASE_S), patient=True)
+
+
 if __name__ == "__main__":
-    write_again_and_again(Path(sys.argv[1]))
+    write_again_and_again(opener(*sys.argv[1:]))

@@ -23,6 +23,7 @@ class TcpProxy:
         self.endpoint = f"tcp/127.0.0.1:{self._listener.getsockname()[1]}"
         self.passed = self.cuts = 0
         self._cut_after = None
+        self._before_cut = lambda: None
         self._refuses = False
         self._open = set()
         self._mutex = threading.Lock()
@@ -47,8 +48,9 @@ class TcpProxy:
         """Take new connections again."""
         self._refuses = False
 
-    def cut_after(self, count):
-        """Break all connections once so many more bytes went through."""
+    def cut_after(self, count, before=lambda: None):
+        """Break all connections once so many more bytes went through, having called `before`."""
+        self._before_cut = before
         self._cut_after = self.passed + count
 
     def _accept(self):
@@ -88,11 +90,14 @@ class TcpProxy:
             while data := source.recv(CHUNK_BYTES):
                 if self._bytes_per_s:
                     time.sleep(len(data) / self._bytes_per_s)
+                if (end := self._cut_after) is not None and self.passed + len(data) >= end:
+                    self._cut_after = None
+                    sink.sendall(data[: max(0, end - self.passed)])
+                    self._before_cut()
+                    self.cut()
+                    break
                 sink.sendall(data)
                 self.passed += len(data)
-                if self._cut_after is not None and self.passed >= self._cut_after:
-                    self._cut_after = None
-                    self.cut()
         except OSError:
             pass
         for one in (source, sink):

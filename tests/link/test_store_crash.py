@@ -59,8 +59,11 @@ def test_acknowledged_batches_survive_kill_9_at_random_moments(tmp_path, writers
     assert acknowledged_in_all > 100
 
 
-def killed_writer(writers, seed, *, run_s):
-    """Let a writer run for `run_s`, kill it, and return the (group, version) it acknowledged."""
+def killed_writer(writers, seed, *, run_s, ready=lambda _: None):
+    """Let a writer run for `run_s`, kill it, and return the (group, version) it acknowledged.
+
+    `ready` is called with its process once it writes, and may kill it before.
+    """
     writers.stdin.write(f"{seed}\n".encode())
     writers.stdin.flush()
     said = b""
@@ -74,6 +77,7 @@ def killed_writer(writers, seed, *, run_s):
                 said += part
             if not pid and b"\n" in said:
                 pid, end_s = int(said.split()[1]), time.monotonic() + run_s
+                ready(pid)
             if time.monotonic() >= end_s:
                 assert pid, "the writer did not open its store"
                 os.kill(pid, signal.SIGKILL)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from store_damage import (
+    CHANGED_ROWS,
     LOG_HEADER_BYTES,
     after_power_cut,
     flip,
@@ -228,10 +229,7 @@ def test_row_that_drops_out_of_its_page_is_refused(closed):
 def test_row_that_was_changed_by_hand_is_refused(closed):
     """A row with a wrong version, type or place does not pass for a record."""
     for change in (
-        "UPDATE record SET batch = batch + 1 WHERE id = 9",
-        "UPDATE record SET kind = 3 WHERE id = 9",
-        "UPDATE record SET kind = 99 WHERE id = 9",
-        "UPDATE record SET body = 'text' WHERE id = 9",
+        *(f"UPDATE record SET {change} WHERE id = 9" for change in CHANGED_ROWS),
         "INSERT INTO record SELECT 7777, kind, batch, key, body, crc FROM record WHERE id = 9",
         "DELETE FROM record WHERE kind = 0",
     ):
