@@ -23,7 +23,12 @@ from environment import PYTHON, ROOT, give_up, say
 
 REQUIREMENTS = ROOT / "deploy" / "requirements"
 WHEELS = ROOT / "deploy" / "wheels"
-LOCKS = ("build.txt", "core.txt", "record.txt", "keys.txt", "perception.txt", "workcell.txt")
+LOCKS = (
+    *("build.txt", "core.txt", "record.txt", "keys.txt"),
+    *("perception.txt", "workcell.txt", "database.txt"),
+)
+PACKAGES = ("libraries.txt", "database_packages.txt")
+"""Packages of Debian that images unpack, as installing them would bring several times as much."""
 SUITE = "bookworm"
 BASE_TAG = f"enact-ci-base:{SUITE}"
 BASE_PACKAGES = "python3,python3-pip,python3-venv,ca-certificates,usr-is-merged"
@@ -87,9 +92,9 @@ def run(*words: str, cwd: Path | None = None) -> None:
 
 
 def base() -> Path:
-    """Return a folder with base.tar, a Debian with Python, and the packages of libraries.txt."""
-    libraries = (REQUIREMENTS / "libraries.txt").read_text("utf-8").split()
-    fetch = f"cd /libraries && apt-get download -qq {' '.join(libraries)}"
+    """Return a folder with base.tar, a Debian with Python, and the packages that images unpack."""
+    packages = {name for file in PACKAGES for name in (REQUIREMENTS / file).read_text("utf-8").split()}
+    fetch = f"cd /packages && apt-get download -qq {' '.join(sorted(packages))}"
     words = [
         "mmdebstrap",
         "--quiet",
@@ -99,7 +104,7 @@ def base() -> Path:
         "--hook-dir=/usr/share/mmdebstrap/hooks/merged-usr",
         *(f"--dpkgopt=path-exclude={pattern}" for pattern in LEFT_OUT),
         *(f"--customize-hook={hook}" for hook in BASE_HOOKS),
-        '--customize-hook=mkdir -m 777 "$1"/libraries',
+        '--customize-hook=mkdir -m 777 "$1"/packages',
         f"--customize-hook=chroot \"$1\" sh -c '{fetch}'",
     ]
 
@@ -107,8 +112,8 @@ def base() -> Path:
         say(f"making a base image of Debian {SUITE} (a minute, once)")
         out = (
             f'--aptopt=Acquire::Retries "{RETRIES}"',
-            f"--customize-hook=sync-out /libraries {folder}",
-            '--customize-hook=rm -r "$1"/libraries',
+            f"--customize-hook=sync-out /packages {folder}",
+            '--customize-hook=rm -r "$1"/packages',
         )
         run(*words, *out, SUITE, str(folder / "base.tar"))
 
