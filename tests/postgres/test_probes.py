@@ -71,9 +71,12 @@ def test_a_standby_is_ready_while_it_sees_its_database_and_alive_without(cell, s
         cell.start(1, says=STANDS_BY, store=server.url.replace(str(server.port), port))
         cell.becomes(1, "/ready", 200)
         _, page = cell.ask(1, "/metrics")
-        (sample,) = [line for line in page.splitlines() if not line.startswith("#")]
-        assert sample.startswith("enact_standby{")
-        assert sample.endswith(f'shard="{SHARD}"}} 1')
+        samples = [line for line in page.splitlines() if not line.startswith("#")]
+        assert samples[0].startswith("enact_standby{")
+        assert samples[0].endswith(f'shard="{SHARD}"}} 1')
+        counted = {line.partition("{")[0]: float(line.split()[-1]) for line in samples[1:]}
+        names = ("slow_looks", "reloads", "reloads_refused")
+        assert counted == {f"enact_{name}_total": 0 for name in names}
 
         proxy.refuse()
         cell.becomes(1, "/ready", UNAVAILABLE)

@@ -14,6 +14,7 @@ from test_store_ledger import BATCHES, at_work
 from enact_dist.core.protocol.records import HistoryForgotten, Persist
 from enact_dist.link.postgres import ahead, opening
 from enact_dist.link.postgres.standby import wait_free
+from enact_dist.link.store.gathering import Rows
 from enact_dist.terms import Durability
 
 GOES_ON = threading.Event()
@@ -24,7 +25,7 @@ GOES_ON = threading.Event()
 @given(batches=BATCHES, data=st.data())
 def test_what_was_read_ahead_makes_no_difference(server, batches, data):
     """Deleted and forgotten rows, labels and causes: after each takeover it is the ledger."""
-    address, expected, rows, batch = address_of(server.url), State(), {}, 0
+    address, expected, rows, batch = address_of(server.url), State(), Rows(), 0
     store, _, medium = take(address)
     try:
         for persists, restarts in (*batches, ((), True)):
@@ -54,7 +55,7 @@ def _same_as_fresh(medium, address, rows):
     session, shard = medium.line._session, medium._tenure.shard
     seen = opening.look(session, address)[1]
     late, fresh = (
-        opening.read_whole(session, shard, seen.batch, "a test", some) for some in (rows, {})
+        opening.read_whole(session, shard, seen.batch, "a test", some) for some in (rows, Rows())
     )
     for one in fields(fresh):
         if one.name == "states":
@@ -85,7 +86,7 @@ def test_a_standby_reads_ahead_and_follows(server, stores, stopped):
     store.write([Persist(1, (forgotten,), Durability.OS), state(1, "late")])
     store.close()
     standby.join(20)
-    assert len(found[0].rows) > 50
+    assert len(found[0].rows.by_id) > 50
 
     store, recovered = opening.open_database(found[0], unix_s=1)
     with closing(store):
@@ -109,11 +110,14 @@ def test_rows_that_only_a_lost_primary_had_are_read_again(server, stores):
     store, _, medium = stores.open(address)
     store.write([state(1, "a"), state(1, "b")])
     source = ahead.RowReader(medium.line._session, medium._tenure.shard, str(address), GOES_ON)
-    rows = {}
+    rows = Rows()
     source.bring_up(rows)
-    for number, row in list(rows.items()):
-        rows[number] = row._replace(crc=row.crc ^ 1, holds=rows[min(rows)].holds)
-    rows[10_000] = rows[max(rows)]._replace(id=10_000)
+    found = list(rows.by_id.values())
+    for row in found:
+        other = next(one for one in found if one.key.kind is row.key.kind)
+        rows.put(row._replace(crc=row.crc ^ 1, batch=row.batch + 7, holds=other.holds))
+    for row in found:
+        rows.put(row._replace(id=10_000 + row.id))
     store.close()
 
     store, recovered, _ = take(address, rows=rows)
