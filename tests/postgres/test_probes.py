@@ -121,3 +121,27 @@ def test_a_page_shows_copies_the_lease_and_a_stall(pair, tmp_path, shard_name, c
         assert value(cell.ask(0, "/metrics")[1], "enact_takeovers_total") == 0
     finally:
         cell.end()
+
+
+def test_slow_looks_of_a_standby_are_counted_logged_and_shown(pair, tmp_path, shard_name, capsys):
+    """The database stands still for longer than half the lease."""
+    await_sync(pair[0])
+    cell = ProbedCell(tmp_path, pair[0].url, f"slow{shard_name}")
+    try:
+        cell.start(0)
+        cell.start(1, says=STANDS_BY)
+        pair[0].pause()
+        try:
+            time.sleep(1.5)  # half a lease, and the pause between two looks
+        finally:
+            pair[0].go_on()
+        cell.shows(1, "enact_slow_looks_total", lambda looks: looks > 0)
+        assert "more than half of lease_s (2 s)" in cell.log(1).read_text()
+        end_s = time.monotonic() + 20.0
+        said = ""
+        while "slow looks at its database) stands by" not in said:
+            assert time.monotonic() < end_s, said
+            main(["doctor", "--cell", str(cell.file)])
+            said = capsys.readouterr().out
+    finally:
+        cell.end()

@@ -304,8 +304,8 @@ OF_A_CONNECTION: Final[dict[str, Figure]] = {
 
 GAUGES_OF_A_SHARD: Final[dict[str, Figure]] = {
     "standby": _gauge(
-        "1 while the daemon stands by for another one that serves the shard; what it counts"
-        " meanwhile is all that is shown beside it"
+        "1 while the daemon stands by for another one that serves the shard; beside it, only what"
+        " it counts meanwhile is shown"
     ),
     "ready": _gauge(
         "1 while the shard grants locks, 0 right after its start and while it shuts down"

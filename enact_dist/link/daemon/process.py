@@ -192,9 +192,9 @@ def take_shard(
     assert settings.store is not None
     require_driver(settings.store.url)
     from enact_dist.link.daemon.metrics import MetricsServer, StandbyProbes
-    from enact_dist.link.postgres.standby import Watch, wait_free
+    from enact_dist.link.postgres.standby import StandbyWatch, wait_free
 
-    own, watch, name = WaitingShard(settings), Watch(), settings.shard.name
+    own, watch, name = WaitingShard(settings), StandbyWatch(), settings.shard.name
     probes = StandbyProbes(settings, watch.shown)
 
     def looked(answered: bool) -> None:

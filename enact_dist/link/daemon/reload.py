@@ -84,7 +84,7 @@ class Reload:
         count: Callable[[str], None],
         certificate: Certificate | None,
     ) -> None:
-        """Let somebody else take them from now on; at once if that was asked meanwhile.
+        """Let something else take them from now on; at once if that was asked meanwhile.
 
         Args:
             take: Takes them and returns the certificate with which the daemon listens now, if it

@@ -39,7 +39,7 @@ LOOK_S: Final = 0.1
 _log = logging.getLogger("enact.shard")
 
 
-class Watch:
+class StandbyWatch:
     """What a standby keeps from one wait for its shard to the next.
 
     Attributes:
@@ -91,7 +91,7 @@ def wait_free(
     patient: bool,
     note: Callable[[str], None],
     looked: Callable[[bool], None] = lambda _: None,
-    watch: Watch | None = None,
+    watch: StandbyWatch | None = None,
 ) -> FreeShard | None:
     """Wait until a shard is free; return it, None once `stopped` is set.
 
@@ -108,7 +108,7 @@ def wait_free(
         StoreError: The database cannot be used, and this one is not patient.
     """
     connector = connector_of(address)
-    watch, standby = watch or Watch(), Standby(round(address.lease_s * 1e9))
+    watch, standby = watch or StandbyWatch(), Standby(round(address.lease_s * 1e9))
     session: DatabaseSession | None = None
     ahead: ReadAhead | None = None
     noted = named = ""
@@ -126,10 +126,8 @@ def wait_free(
                     shard, seen = _look(session, address)
                 if watch.is_stale(time.monotonic() - began_s, address.lease_s):
                     standby.was_away()
-                name = name_of_standby(shard, myself(), watch.figures)
-                if name != named and seen.holder:
-                    named = name
-                    session.row(NAME_ME, (name,))
+                if seen.holder:
+                    named = _named(session, shard, watch.figures, named)
                 if standby.is_free(seen, time.monotonic_ns()):
                     watch.rows = ahead.stop() if ahead is not None else watch.rows
                     return FreeShard(address, seen, watch.rows, stopped)
@@ -138,11 +136,7 @@ def wait_free(
                 answered = True
                 found = f"{address} {NamedHolder.read(seen.holder).in_words}"
                 if standby.alive and not patient:
-                    raise ShardHeldError(
-                        f"{found}: stop it first (a daemon can stand by for it: `enact shard run"
-                        f" {address.shard} --standby`)",
-                        path=str(address),
-                    )
+                    raise _held(found, address)
             except LOST as failure:
                 if not patient:
                     with database_errors(str(address)):
@@ -158,6 +152,22 @@ def wait_free(
             looked(answered)
             stopped.wait(LOOK_S)
     return None
+
+
+def _held(found: str, address: StoreAddress) -> ShardHeldError:
+    return ShardHeldError(
+        f"{found}: stop it first (a daemon can stand by for it: `enact shard run"
+        f" {address.shard} --standby`)",
+        path=str(address),
+    )
+
+
+def _named(session: DatabaseSession, shard: int, figures: StandbyFigures, before: str) -> str:
+    """Let the database list a connection as a standby's, with its figures; return the name."""
+    name = name_of_standby(shard, myself(), figures)
+    if name != before:
+        session.row(NAME_ME, (name,))
+    return name
 
 
 def _look(session: DatabaseSession, address: StoreAddress) -> tuple[int, HolderRow]:
