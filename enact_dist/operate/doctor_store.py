@@ -43,7 +43,7 @@ def holders(config: CellConfig) -> Callable[[str], str]:
         row = found.shards.get(shard)
         if row is None or not (row.holder or row.standbys):
             return "no process holds it in its database, and none stands by"
-        stands_by = f", {', '.join(row.standbys)} stands by" if row.standbys else ""
+        stands_by = row.stands_by and f", {row.stands_by}"
         return f"{row.served}, as its database says{stands_by}"
 
     return why
@@ -81,7 +81,7 @@ def database(config: CellConfig) -> Iterator[Finding]:
                 subject, text, f"start it, or a standby: enact shard run {shard.name} --standby"
             )
         elif row.standbys:
-            yield ok(subject, f"{text}; {', '.join(row.standbys)} stands by")
+            yield ok(subject, f"{text}; {row.stands_by}")
         else:
             yield warn(
                 subject,

@@ -16,6 +16,7 @@ import key_cells
 from enact_dist import Aspect, Entity, Lock, Write, connect
 from enact_dist.cli.main import main
 from enact_dist.cli.shard.reload import catches_hangup, listening_process
+from enact_dist.link.daemon.reload import Reload
 from enact_dist.link.zenoh.tls import look, own_certificate
 from enact_dist.operate.keys import Authority, make_authority
 
@@ -187,3 +188,17 @@ def test_command_and_signal_let_a_daemon_read_its_keys(cell, capsys):
         assert "reloaded in" in daemon.stdout.read()
         daemon.stdout.close()
     assert not catches_hangup(os.getpid())
+
+
+def test_what_is_asked_between_two_daemons_is_done_by_the_next():
+    """A takeover has nothing that takes keys: a signal that comes then is not lost."""
+    reload, taken = Reload(None), []
+    reload.turn_to(lambda: taken.append("standby"), taken.append, None)
+    assert reload()
+    reload.pause()
+    assert not reload()
+    reload.turn_to(lambda: taken.append("shard"), taken.append, None)
+    reload.turn_to(lambda: taken.append("next"), taken.append, None)
+    reload.close()
+
+    assert taken == ["standby", "reloads", "shard", "reloads"]

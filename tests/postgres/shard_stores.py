@@ -22,13 +22,13 @@ def address_of(url, shard="", *, lease_s=2.0):
     return StoreAddress(url, CELL, shard or f"n{os.getpid()}-{next(_numbers)}", lease_s)
 
 
-def take(address, *, unix_s=1, patient=False, rows=()):
+def take(address, *, unix_s=1, patient=False, rows=None):
     """Wait until a shard is free, and take it over; return the store, its content and medium.
 
     `rows` were read ahead.
     """
     free = wait_free(address, stopped=threading.Event(), patient=patient, note=lambda _: None)
-    free = replace(free, rows=dict(rows) or free.rows)
+    free = replace(free, rows=rows or free.rows)
     store, recovered = open_database(free, unix_s=unix_s)
     return store, recovered, store.holding
 

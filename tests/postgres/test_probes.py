@@ -28,9 +28,12 @@ def test_a_standby_is_ready_while_it_sees_its_database_and_alive_without(cell, s
         cell.start(1, says=STANDS_BY, store=server.url.replace(str(server.port), port))
         cell.becomes(1, "/ready", 200)
         _, page = cell.ask(1, "/metrics")
-        (sample,) = [line for line in page.splitlines() if not line.startswith("#")]
-        assert sample.startswith("enact_standby{")
-        assert sample.endswith(f'shard="{SHARD}"}} 1')
+        samples = [line for line in page.splitlines() if not line.startswith("#")]
+        assert samples[0].startswith("enact_standby{")
+        assert samples[0].endswith(f'shard="{SHARD}"}} 1')
+        counted = {line.partition("{")[0]: float(line.split()[-1]) for line in samples[1:]}
+        names = ("slow_looks", "reloads", "reloads_refused")
+        assert counted == {f"enact_{name}_total": 0 for name in names}
 
         proxy.refuse()
         cell.becomes(1, "/ready", UNAVAILABLE)
@@ -67,5 +70,29 @@ def test_a_page_shows_copies_the_lease_and_a_stall(pair, tmp_path, shard_name, c
         cell.shows(0, "enact_store_stalled_s", lambda stalled_s: stalled_s == 0)
         cell.shows(0, "enact_lease_left_s", lambda left_s: left_s > 0)
         assert value(cell.ask(0, "/metrics")[1], "enact_takeovers_total") == 0
+    finally:
+        cell.end()
+
+
+def test_slow_looks_of_a_standby_are_counted_logged_and_shown(pair, tmp_path, shard_name, capsys):
+    """The database stands still for longer than half the lease."""
+    await_sync(pair[0])
+    cell = ProbedCell(tmp_path, pair[0].url, f"slow{shard_name}")
+    try:
+        cell.start(0)
+        cell.start(1, says=STANDS_BY)
+        pair[0].pause()
+        try:
+            time.sleep(1.5)  # half a lease, and the pause between two looks
+        finally:
+            pair[0].go_on()
+        cell.shows(1, "enact_slow_looks_total", lambda looks: looks > 0)
+        assert "more than half of lease_s (2 s)" in cell.log(1).read_text()
+        end_s = time.monotonic() + 20.0
+        said = ""
+        while "slow looks at its database) stands by" not in said:
+            assert time.monotonic() < end_s, said
+            main(["doctor", "--cell", str(cell.file)])
+            said = capsys.readouterr().out
     finally:
         cell.end()

@@ -1,4 +1,7 @@
-"""`enact shard reload`: lets running shards of this host take keys, names and rights anew."""
+"""`enact shard reload`: lets daemons of this host take keys, names and rights anew.
+
+A standby takes them, too.  It answers no client, so what it counts stands in its database.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import os
 import signal
 import socket
 import time
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -16,6 +20,7 @@ from enact_dist.link.zenoh.endpoints import split_endpoint
 
 if TYPE_CHECKING:
     import argparse
+    from collections.abc import Callable, Iterator
 
     from enact_dist.config.types import CellConfig, ShardConfig
     from enact_dist.world.cell import Cell
@@ -40,13 +45,16 @@ def reload_shards(options: argparse.Namespace) -> Output:
     here = [one for one in config.shards if one.host in {"", host}]
     rows: list[dict[str, Any]] = []
     for shard in here if options.all else [config.shard(options.name)]:
-        status, text = _reload(config, shard, options)
-        rows.append({"shard": shard.name, "status": status, "text": text})
+        for status, text in _reload(config, shard, options):
+            rows.append({"shard": shard.name, "status": status, "text": text})
     lines = [f"shard {row['shard']}: {row['text']}" for row in rows]
     return Output(rows, "\n".join(lines), status=max((row["status"] for row in rows), default=DONE))
 
 
-def _reload(config: CellConfig, shard: ShardConfig, options: argparse.Namespace) -> tuple[int, str]:
+def _reload(
+    config: CellConfig, shard: ShardConfig, options: argparse.Namespace
+) -> Iterator[tuple[int, str]]:
+    """Yield status and text for each daemon of a shard on this host: one, or standbys beside it."""
     from enact_dist.link.daemon.reload import checked_keys
     from enact_dist.link.zenoh.tls import shard_keys
 
@@ -56,28 +64,61 @@ def _reload(config: CellConfig, shard: ShardConfig, options: argparse.Namespace)
             checked_keys(keys, ())
         config.shard_settings(shard.name)
     except ConfigError as error:
-        return FAILED, f"not told to reload, which it would refuse: {error}"
-    endpoint = next((one for one in shard.listen if split_endpoint(one)[2].isdecimal()), "")
-    process = listening_process(int(split_endpoint(endpoint)[2]))
-    if process is None:
-        where = f"no process of this user listens at {endpoint} on this host"
-        return UNREACHABLE, f"{where}; run this where the shard runs, as its user"
-    if not catches_hangup(process):
-        return FAILED, f"process {process} at {endpoint} is no shard with keys or rights: not told"
-    with open_cell(options) as cell:
-        before = _counts(cell, shard.name)
-        if before is None:
-            return UNREACHABLE, "does not answer, so it was not told to reload"
-        os.kill(process, signal.SIGHUP)
-        end_s = time.monotonic() + RELOAD_S
-        while time.monotonic() < end_s:
-            now = _counts(cell, shard.name) or before
-            if now[1] > before[1]:
-                return FAILED, "keeps its old keys, names and rights; its log says why"
-            if now[0] > before[0]:
-                return DONE, "reloaded"
-            time.sleep(PAUSE_S)
+        yield FAILED, f"not told to reload, which it would refuse: {error}"
+        return
+    ports = {split_endpoint(one)[2]: one for one in (*shard.advertise, *shard.listen)}
+    found = {
+        process: at
+        for port, at in ports.items()
+        if port.isdecimal() and (process := listening_process(int(port))) is not None
+    }
+    if not found:
+        where = f"no process of this user listens at {', '.join(ports.values())} on this host"
+        yield UNREACHABLE, f"{where}; run this where the shard runs, as its user"
+    stand_by = _standbys(config, shard.name)
+    for process, endpoint in found.items():
+        who = f"{socket.gethostname()} {process}"
+        if not catches_hangup(process):
+            text = f"process {process} at {endpoint} is no shard with keys or rights: not told"
+            yield FAILED, text
+        elif who in stand_by:
+            status, text = _told(process, lambda who: _standbys(config, shard.name).get(who), who)
+            yield status, f"{who}, which stands by, {text}"
+        else:
+            with open_cell(options) as cell:
+                yield _told(process, partial(_counts, cell), shard.name)
+
+
+def _told(
+    process: int, counts: Callable[[str], tuple[int, int] | None], name: str
+) -> tuple[int, str]:
+    """Tell a daemon to reload; return what became of it, by what `counts` shows of its name."""
+    before = counts(name)
+    if before is None:
+        return UNREACHABLE, "does not answer, so it was not told to reload"
+    os.kill(process, signal.SIGHUP)
+    end_s = time.monotonic() + RELOAD_S
+    while time.monotonic() < end_s:
+        now = counts(name) or before
+        if now[1] > before[1]:
+            return FAILED, "keeps its old keys, names and rights; its log says why"
+        if now[0] > before[0]:
+            return DONE, "reloaded"
+        time.sleep(PAUSE_S)
     return FAILED, f"has not reloaded for {RELOAD_S:g} s; see its log"
+
+
+def _standbys(config: CellConfig, shard: str) -> dict[str, tuple[int, int]]:
+    """Return how often each standby of a shard has reloaded and how often it could not."""
+    if not config.store:
+        return {}
+    from enact_dist.link.postgres.address import require_driver
+
+    require_driver(config.store)
+    from enact_dist.link.postgres.examine import standbys_of
+
+    found = standbys_of(config.store, config.name, shard)
+    return {who: (one.reloads, one.reloads_refused) for who, one in found.items()}
 
 
 def _counts(cell: Cell, shard: str) -> tuple[int, int] | None:

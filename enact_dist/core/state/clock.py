@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import heapq
 from bisect import bisect_left
+from operator import attrgetter
 from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
 from enact_dist.core.protocol.messages import Refused
@@ -79,7 +80,8 @@ STAMP_NS_MAX: Final = 1 << 62
 
 def newest_stamp(recovered: Recovered) -> tuple[int, str]:
     """Return the largest stamp of what a store has kept, and what has it; 0 where nothing is."""
-    stamps = [(record.stamp_ns, f"slot {record.slot}") for record in recovered.slots]
+    newest = max(recovered.slots, key=attrgetter("stamp_ns"), default=None)  # there may be many
+    stamps = [(newest.stamp_ns, f"slot {newest.slot}")] if newest is not None else []
     # A fork without slots here was made as of then, too: nothing may be committed before.
     stamps += [(record.at_ns, f"world context {record.name}") for record in recovered.worlds]
     # Nor before what was forgotten with its aspect.

@@ -168,6 +168,11 @@ OF_A_SHARD: Final[dict[str, Figure]] = {
         "1 if this start took the shard over from a daemon that had not given it back",
         "the log of that daemon, or of its host, gives the reason",
     ),
+    "slow_looks": Figure(
+        "looks of a standby at its shard's row that took more than half of `lease_s`; it counts the"
+        " lease anew after each, so a takeover comes later",
+        "look at the database and the way to it: enact doctor; or at the standby's host: top",
+    ),
     "silences": Figure(
         "times that answers waited, since the database had confirmed nothing for `lease_s`",
         "look at the database and the way to it: enact doctor",
@@ -299,7 +304,8 @@ OF_A_CONNECTION: Final[dict[str, Figure]] = {
 
 GAUGES_OF_A_SHARD: Final[dict[str, Figure]] = {
     "standby": _gauge(
-        "1 while the daemon stands by for another one that serves the shard; nothing else is shown"
+        "1 while the daemon stands by for another one that serves the shard; beside it, only what"
+        " it counts meanwhile is shown"
     ),
     "ready": _gauge(
         "1 while the shard grants locks, 0 right after its start and while it shuts down"

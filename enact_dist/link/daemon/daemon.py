@@ -7,13 +7,13 @@ import os
 import secrets
 import threading
 import time
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.messages import ListLocks, Locks
 from enact_dist.core.protocol.records import Called, SessionBarred, SessionSeen, ShardReturned
-from enact_dist.errors import ConfigError, LinkError, StoreError
+from enact_dist.errors import ConfigError, LinkError
 from enact_dist.link.client.calls import Calls
 from enact_dist.link.client.duplicate_daemons import Comparing
 from enact_dist.link.daemon.reload import Reload, checked_keys
@@ -25,14 +25,13 @@ from enact_dist.link.lease import ShardTakenError
 from enact_dist.link.log import JsonLines, TextLines, last_words
 from enact_dist.link.memory.shared_folder import SharedFolder
 from enact_dist.link.opening import open_host
-from enact_dist.link.postgres.address import require_driver
 from enact_dist.link.socket.service import SocketService
 from enact_dist.link.zenoh.config import close_session, listening_settings, open_session
 from enact_dist.link.zenoh.service import ZenohService
 from enact_dist.wire.keys import name_in
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Container, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Container, Iterable, Mapping
 
     import zenoh
 
@@ -46,8 +45,6 @@ RECONNECT_S: Final = 2.0
 """How long clients may take to connect again when the shard has taken new keys."""
 REOPEN_S, REOPEN_PAUSE_S = 5.0, 0.02
 """How long the port may take to be free for the shard's next Zenoh session."""
-TAKE_AGAIN_S: Final = 1.0
-"""Pause of a standby after a takeover that failed."""
 
 _log = logging.getLogger("enact.shard")
 
@@ -61,6 +58,7 @@ class RunningShard:
         free: The shard in a database that it takes over, in place of a folder.
         session: The Zenoh session that serves it, which clients know already; None: a new one.
         metrics: A server that shows this shard from now on; None: a new one, if one is wanted.
+        reload: Of this process, which this shard follows until its end; None: one of its own.
 
     Attributes:
         moves_to: The standby that an operator asked it to give the shard to; "": none.
@@ -73,6 +71,7 @@ class RunningShard:
         free: FreeShard | None = None,
         session: zenoh.Session | None = None,
         metrics: MetricsServer | None = None,
+        reload: Reload | None = None,
     ) -> None:
         self.settings = settings
         self._ended = threading.Event()
@@ -128,10 +127,11 @@ class RunningShard:
                 self._successor = Successor(self.host, settings, self._has_failed)
                 undo.callback(self._successor.close)
                 self.host.silence.on_move(self._move)
-            self.reload: Reload | None = None
-            if settings.keys is not None or settings.shard.rights is not None:
-                self.reload = Reload(self._take_again, self.host.count, settings.keys, certificate)
+            self._own_reload = Reload(settings.keys) if reload is None and settings.change else None
+            self.reload = self._own_reload or reload
             undo.pop_all()
+        if self.reload is not None:
+            self.reload.turn_to(self._take_again, self.host.count, certificate)
 
     def _shown(self, metrics: MetricsServer | None, undo: ExitStack) -> MetricsServer | None:
         if self.settings.metrics is None:
@@ -161,7 +161,7 @@ class RunningShard:
         self._ended.set()
 
     def _open_session(self) -> zenoh.Session:
-        return _session_of(self.settings, self._names)
+        return listening_session(self.settings, self._names)
 
     def _served(self) -> ZenohService:
         proven = self._names is not None
@@ -202,7 +202,7 @@ class RunningShard:
         before.close()
         close_session(self._session)
         try:
-            self._session = _reopened(self._open_session)
+            self._session = reopened(self._open_session)
             self._service = self._served()
         except Exception as error:
             _log.critical("shard %s cannot listen again: %s", self.settings.shard.name, error)
@@ -239,7 +239,9 @@ class RunningShard:
     def stop(self, *, drain_s: float = DRAIN_S) -> None:
         """Drain, answer parked requests, close connections and store; idempotent."""
         if self.reload is not None:
-            self.reload.close()
+            self.reload.pause()
+        if self._own_reload is not None:
+            self._own_reload.close()
         with self._stopping:
             if self._stopped:
                 return
@@ -292,7 +294,7 @@ class RunningShard:
             )
 
 
-def _session_of(settings: DaemonSettings, names: Mapping[str, str] | None) -> zenoh.Session:
+def listening_session(settings: DaemonSettings, names: Mapping[str, str] | None) -> zenoh.Session:
     """Open the Zenoh session at which a shard listens; `names` are those of clients with keys."""
     return open_session(
         listen=settings.listen,
@@ -307,7 +309,7 @@ def _session_of(settings: DaemonSettings, names: Mapping[str, str] | None) -> ze
     )
 
 
-def _reopened(opened: Callable[[], zenoh.Session]) -> zenoh.Session:
+def reopened(opened: Callable[[], zenoh.Session]) -> zenoh.Session:
     """Open a session at a port that this process has just given up."""
     end_s = time.monotonic() + REOPEN_S
     while True:
@@ -336,106 +338,33 @@ def _shared_folder(settings: DaemonSettings) -> SharedFolder | None:
         return None
 
 
-def start_shard(settings: DaemonSettings) -> RunningShard:
+def start_shard(settings: DaemonSettings, reload: Reload | None = None) -> RunningShard:
     """Start a shard in this process; return when it is ready.
+
+    Args:
+        settings: The settings of the shard.
+        reload: Of this process; None: one of its own, if there is anything to take anew.
 
     Raises:
         StoreError: The folder is in use, unreadable or corrupt.
         LinkError: An endpoint is in use, or another daemon already serves this shard.
         ConfigError: An endpoint cannot be read, or is missing, or the keys cannot be used.
     """
-    return RunningShard(settings, _check(settings))
+    return RunningShard(settings, checked(settings), reload=reload)
 
 
-def _check(settings: DaemonSettings) -> Certificate | None:
+def checked(settings: DaemonSettings) -> Certificate | None:
+    """Return the certificate of a shard that may start, None in a cell without keys.
+
+    Raises:
+        As `start_shard`.
+    """
     if not settings.listen:
         raise ConfigError(f"shard {settings.shard.name} has no endpoint to listen at")
     keys = settings.keys
     certificate = checked_keys(keys, settings.hosts) if keys is not None else None
     refuse_second_daemon(settings)
     return certificate
-
-
-def take_shard(
-    settings: DaemonSettings, stopped: threading.Event, waiting: Callable[[], None]
-) -> RunningShard | None:
-    """Start a shard in a database once no other daemon serves it; None once `stopped` is set.
-
-    The Zenoh session is open all the while, so clients are connected to a standby before it serves.
-
-    Args:
-        settings: The settings of the shard, with its place.
-        stopped: Ends the wait.
-        waiting: Called ten times a second.
-
-    Raises:
-        As `start_shard`; a standby waits for its database, too.
-    """
-    assert settings.store is not None
-    require_driver(settings.store.url)
-    from enact_dist.link.daemon.metrics import MetricsServer, StandbyProbes
-    from enact_dist.link.postgres.standby import wait_free
-
-    certificate = _check(settings)
-    name, patient = settings.shard.name, settings.standby
-    probes = StandbyProbes(settings)
-
-    def looked(answered: bool) -> None:
-        probes.looked(answered)
-        waiting()
-
-    with ExitStack() as undo:
-        session = _reopened(lambda: _session_of(settings, settings.common_names))
-        undo.callback(close_session, session)
-        metrics = None
-        if settings.metrics is not None:
-            metrics = MetricsServer(settings.metrics, probes.source())
-            undo.callback(metrics.close)
-        while free := wait_free(
-            settings.store,
-            stopped=stopped,
-            patient=patient,
-            note=lambda text: _log.info("shard %s stands by: %s", name, text),
-            looked=looked,
-        ):
-            probes.takes()
-            try:
-                with _each_second(waiting, name):
-                    shard = RunningShard(settings, certificate, free, session, metrics)
-            except StoreError as error:
-                if stopped.is_set():
-                    return None
-                if not patient:
-                    raise
-                _log.warning("shard %s stands by again: %s", name, error)
-                stopped.wait(TAKE_AGAIN_S)
-            else:
-                undo.pop_all()
-                return shard
-    return None
-
-
-@contextmanager
-def _each_second(act: Callable[[], None], name: str) -> Iterator[None]:
-    """Call a function each second: a takeover that reads for long must pass for alive."""
-    over = threading.Event()
-
-    def go_on() -> None:
-        if not over.wait(1.0):
-            text = (
-                "shard %s is being taken over: it is read, or the database has not confirmed that"
-            )
-            _log.info(text, name)
-        while not over.wait(1.0):
-            act()
-
-    thread = threading.Thread(target=go_on, name="enact-takeover", daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        over.set()
-        thread.join()
 
 
 def formatter_of(settings: DaemonSettings) -> logging.Formatter:

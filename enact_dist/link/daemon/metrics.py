@@ -31,7 +31,7 @@ from enact_dist.errors import LinkError
 from enact_dist.link.daemon.counters import GAUGES_OF_A_SHARD, LATENCIES_OF_A_SHARD, OF_A_SHARD
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from enact_dist.core.state.clock import Latencies
     from enact_dist.link.daemon.settings import DaemonSettings
@@ -245,23 +245,20 @@ class StandbyProbes:
 
     Args:
         settings: The settings of its shard, with an address for metrics.
+        figures: Returns what it has counted, by name.
     """
 
-    def __init__(self, settings: DaemonSettings) -> None:
+    def __init__(self, settings: DaemonSettings, figures: Callable[[], dict[str, int]]) -> None:
         self._alive, self._sees = Pulse(ALIVE_S), Pulse(SEES_S)
         self._alive.beat()
         self._takes = False
-        labels = _labels(settings.cell, settings.shard.name)
-        self._page = "".join(
-            f"# HELP {one.name} {one.meaning}\n# TYPE {one.name} gauge\n{one.name}{{{labels}}} 1\n"
-            for one in METRICS
-            if one.figure == "standby"
-        )
+        self._labels = _labels(settings.cell, settings.shard.name)
+        self._figures = figures
 
     def source(self) -> MetricsSource:
         """Return it for a server."""
         return MetricsSource(
-            page=lambda: self._page,
+            page=lambda: _listed({"standby": 1, **self._figures()}, self._labels, {}),
             alive=lambda: self._takes or self._alive(),
             ready=lambda: not self._takes and self._sees(),
             count=lambda _: None,
@@ -281,16 +278,21 @@ class StandbyProbes:
 
 def page(host: ShardHost, cell: str) -> str:
     """Return all metrics of a shard in the format of Prometheus, without locking the shard."""
-    labels = _labels(cell, host.name)
-    figures, latencies = host.figures(), host.latencies()
+    figures = dict.fromkeys(GAUGES_OF_A_SHARD | OF_A_SHARD, 0.0) | host.figures()
+    return _listed(figures, _labels(cell, host.name), host.latencies())
+
+
+def _listed(figures: Mapping[str, float], labels: str, latencies: Mapping[str, Latencies]) -> str:
     lines: list[str] = []
     for metric in METRICS:
+        if metric.figure not in (latencies if metric.kind == "histogram" else figures):
+            continue
         help_ = metric.meaning.replace("\\", r"\\").replace("\n", r"\n")
         lines += [f"# HELP {metric.name} {help_}", f"# TYPE {metric.name} {metric.kind}"]
         if metric.kind == "histogram":
             lines += _histogram(metric.name, labels, latencies[metric.figure])
         else:
-            lines.append(f"{metric.name}{{{labels}}} {_number(figures.get(metric.figure, 0))}")
+            lines.append(f"{metric.name}{{{labels}}} {_number(figures[metric.figure])}")
     return "\n".join((*lines, ""))
 
 

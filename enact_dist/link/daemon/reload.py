@@ -56,36 +56,58 @@ def checked_keys(keys: KeyFiles, hosts: Iterable[str]) -> Certificate:
 
 
 class Reload:
-    """Takes the settings of a shard anew.  Thread-safe.
+    """Takes the settings of a daemon anew: of a shard, or of a standby for one.  Thread-safe.
+
+    What is asked between the two, during a takeover for example, is done by the next one.
 
     Args:
-        take: Takes them and returns the certificate with which the shard serves now, if it has one;
-            raises `EnactError` and keeps the old ones if they cannot be used.
-        count: Adds to a counter of the shard.
         keys: The shard's files, in a cell with keys.
-        certificate: The one with which the shard serves now.
     """
 
-    def __init__(
-        self,
-        take: Callable[[], Certificate | None],
-        count: Callable[[str], None],
-        keys: KeyFiles | None,
-        certificate: Certificate | None,
-    ) -> None:
-        self._take, self._count, self._keys = take, count, keys
-        self._certificate = certificate
+    def __init__(self, keys: KeyFiles | None) -> None:
+        self._keys = keys
+        self._take: Callable[[], Certificate | None] | None = None
+        self._count: Callable[[str], None] = lambda _: None
+        self._certificate: Certificate | None = None
         self._taken_ns = self._changed_ns()
+        self._asked = False
         self._ended = threading.Event()
-        self._mutex = threading.Lock()
+        self._mutex = threading.RLock()
         self._thread: threading.Thread | None = None
         if keys is not None:
             self._thread = threading.Thread(target=self._run, name="enact-keys", daemon=True)
             self._thread.start()
 
+    def turn_to(
+        self,
+        take: Callable[[], Certificate | None],
+        count: Callable[[str], None],
+        certificate: Certificate | None,
+    ) -> None:
+        """Let something else take them from now on; at once if that was asked meanwhile.
+
+        Args:
+            take: Takes them and returns the certificate with which the daemon listens now, if it
+                has one; raises `EnactError` and keeps the old ones if they cannot be used.
+            count: Adds to a counter.
+            certificate: The one with which the daemon listens now.
+        """
+        with self._mutex:
+            self._take, self._count, self._certificate = take, count, certificate
+            if self._asked:
+                self()
+
+    def pause(self) -> None:
+        """Take nothing until the next `turn_to`; a reload that goes on is waited for."""
+        with self._mutex:
+            self._take = None
+
     def __call__(self) -> bool:
         """Take them as they are now; return whether that worked, and log it."""
         with self._mutex:
+            self._asked = self._take is None
+            if self._take is None:
+                return False
             self._taken_ns = self._changed_ns()
             began_s = time.monotonic()
             try:

@@ -67,6 +67,11 @@ class DaemonSettings:
     standby: bool = False
 
     @property
+    def change(self) -> bool:
+        """Whether a reload has anything to take."""
+        return self.keys is not None or self.shard.rights is not None
+
+    @property
     def common_names(self) -> dict[str, str] | None:
         """The common names of the clients' certificates by their names; None without keys.
 

@@ -60,8 +60,8 @@ if TYPE_CHECKING:
     from enact_dist.link.postgres.connection import DatabaseSession
     from enact_dist.link.postgres.opening import HeldShard
     from enact_dist.link.store.database import DatabaseRow
+    from enact_dist.link.store.gathering import Contents
     from enact_dist.link.store.media import RowSource
-    from enact_dist.link.store.recovery import Contents
 
     Rows = Generator[DatabaseRow, None, None]
 

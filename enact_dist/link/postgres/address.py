@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from enact_dist.config.types import without_password
@@ -12,7 +12,7 @@ from enact_dist.errors import StoreError
 if TYPE_CHECKING:
     import threading
 
-    from enact_dist.link.store.recovery import CheckedRow
+    from enact_dist.link.store.gathering import Rows
 
 LEASE_S_DEFAULT: Final = 2.0
 """How long a shard may answer after its last confirmed write, seconds."""
@@ -46,14 +46,33 @@ class FreeShard:
     Attributes:
         address: Its place.
         seen: Its row.
-        rows: What was read ahead of it, by number.
+        rows: What was read ahead of it, for this takeover or the next try; None: nothing.
         stopped: Breaks the takeover off.
     """
 
     address: StoreAddress
     seen: HolderRow
-    rows: dict[int, CheckedRow] = field(default_factory=dict)
+    rows: Rows | None = None
     stopped: threading.Event | None = None
+
+
+class StandbyFigures(NamedTuple):
+    """What a standby has counted since it began to stand by.
+
+    Attributes:
+        reloads: Times that it took keys, names and rights anew.
+        reloads_refused: Times that it could not.
+        slow_looks: Looks at the shard's row that took so long that it had to count anew.
+    """
+
+    reloads: int = 0
+    reloads_refused: int = 0
+    slow_looks: int = 0
+
+    @property
+    def in_words(self) -> str:
+        """What an operator should know of them, with a blank before it."""
+        return f" ({self.slow_looks} slow looks at its database)" if self.slow_looks else ""
 
 
 _TO: Final = " > "

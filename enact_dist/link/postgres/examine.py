@@ -6,17 +6,25 @@ It changes nothing and takes nothing over.
 from __future__ import annotations
 
 import time
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 import psycopg
 
 from enact_dist.errors import StoreError
-from enact_dist.link.postgres.address import NamedHolder
+from enact_dist.link.postgres.address import NamedHolder, StandbyFigures
 from enact_dist.link.postgres.connection import Connector, in_one_line, myself
 from enact_dist.link.postgres.line import RENEW_S
 from enact_dist.link.postgres.medium import remedy_of
-from enact_dist.link.postgres.tables import COPIES, MISSING, SHARDS, STANDBYS
+from enact_dist.link.postgres.tables import (
+    COPIES,
+    MISSING,
+    SHARDS,
+    STANDBYS,
+    read_standby,
+    state_of_shard,
+)
 
 if TYPE_CHECKING:
     from enact_dist.link.postgres.connection import DatabaseSession
@@ -34,14 +42,14 @@ class ShardRow:
         holder: Host and process that serve it; empty: none does.
         epoch: Its epoch.
         batch: Number of its newest batch.
-        standbys: Hosts and processes that stand by for it.
+        standbys: Hosts and processes that stand by for it, with what they have counted.
         alive: Whether the holder renewed its lease while this was looked at.
     """
 
     holder: str
     epoch: int
     batch: int
-    standbys: tuple[str, ...] = ()
+    standbys: dict[str, StandbyFigures] = field(default_factory=dict)
     alive: bool = False
 
     @property
@@ -54,6 +62,12 @@ class ShardRow:
             if self.alive
             else f"last served by {self.holder}, which shows no sign of life"
         )
+
+    @property
+    def stands_by(self) -> str:
+        """Who stands by, for people; empty: no process does."""
+        who = ", ".join(f"{who}{figures.in_words}" for who, figures in self.standbys.items())
+        return f"{who} stands by" if who else ""
 
 
 @dataclass(slots=True)
@@ -104,6 +118,25 @@ def examine_database(url: str, cell: str) -> DatabaseReport:
     return found
 
 
+def standbys_of(url: str, cell: str, shard: str) -> dict[str, StandbyFigures]:
+    """Return who stands by for a shard, with what they have counted; empty if it cannot be seen."""
+    with (
+        suppress(psycopg.Error, StoreError),
+        closing(Connector(url, f"enact on {myself()}").connect()) as session,
+    ):
+        row = session.row(*state_of_shard(cell, shard))
+        return _standbys(session).get(row[0], {}) if row is not None else {}
+    return {}
+
+
+def _standbys(session: DatabaseSession) -> dict[int, dict[str, StandbyFigures]]:
+    found: dict[int, dict[str, StandbyFigures]] = {}
+    for (text,) in session.connection.execute(STANDBYS):
+        shard, who, figures = read_standby(text)
+        found.setdefault(shard, {})[who] = figures
+    return found
+
+
 def _fill(found: DatabaseReport, session: DatabaseSession, cell: str) -> None:
     found.version = str((session.row("SHOW server_version") or ("unknown",))[0])
     found.named = str((session.row("SHOW synchronous_standby_names") or ("",))[0])
@@ -115,10 +148,7 @@ def _fill(found: DatabaseReport, session: DatabaseSession, cell: str) -> None:
             found.others += (f"{name} ({sync or 'not visible'}, {state or 'not visible'})",)
     if found.missing:
         return
-    standbys: dict[int, tuple[str, ...]] = {}
-    for text in session.connection.execute(STANDBYS):
-        _, shard, who = text[0].split("/", 2)
-        standbys[int(shard)] = (*standbys.get(int(shard), ()), who)
+    standbys = _standbys(session)
     before = {row[0]: row for row in session.connection.execute(SHARDS, (cell,))}
     if any(row[-1] for row in before.values()):
         time.sleep(BEAT_S)
@@ -126,4 +156,4 @@ def _fill(found: DatabaseReport, session: DatabaseSession, cell: str) -> None:
         row_id, name, epoch, batch, _, text = row
         holder = NamedHolder.read(text).process
         alive = bool(holder) and row != before.get(row_id)
-        found.shards[name] = ShardRow(holder, epoch, batch, standbys.get(row_id, ()), alive)
+        found.shards[name] = ShardRow(holder, epoch, batch, standbys.get(row_id, {}), alive)

@@ -24,16 +24,17 @@ from enact_dist.link.postgres.line import HeldRow, Renewer
 from enact_dist.link.postgres.medium import PostgresMedium, database_errors
 from enact_dist.link.postgres.tables import BODIES, FENCE, ROWS, make_tables, state_of_shard
 from enact_dist.link.store.database import DatabaseRow
-from enact_dist.link.store.recovery import gather, put_together, read_blobs
+from enact_dist.link.store.gathering import Rows
+from enact_dist.link.store.recovery import put_together, read_blobs
 from enact_dist.link.store.store import Store
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator
 
     from enact_dist.core.protocol.records import Recovered
     from enact_dist.link.postgres.address import FreeShard, StoreAddress
     from enact_dist.link.postgres.connection import DatabaseSession
-    from enact_dist.link.store.recovery import CheckedRow, Contents
+    from enact_dist.link.store.gathering import Contents
 
 
 def look(session: DatabaseSession, address: StoreAddress) -> tuple[int, HolderRow]:
@@ -92,7 +93,7 @@ def read_whole(
     shard: int,
     batch: int,
     name: str,
-    ahead: Mapping[int, CheckedRow] | None = None,
+    ahead: Rows | None = None,
 ) -> Contents:
     """Read and check a shard with its bodies, but for the rows that were read ahead.
 
@@ -184,7 +185,7 @@ def read_rows(
     shard: int,
     batch: int,
     name: str,
-    ahead: Mapping[int, CheckedRow] | None = None,
+    ahead: Rows | None = None,
 ) -> Contents:
     """Read and check all rows of a shard, but for those that were read ahead.
 
@@ -193,15 +194,16 @@ def read_rows(
         shard: Number of the shard.
         batch: Number of its newest batch.
         name: Its place, for people.
-        ahead: Rows that are there already, by number.
+        ahead: Rows that are there already.
 
     Raises:
         StoreError: They are damaged.
         psycopg.Error: As the database reports it.
     """
-    rows = dict(ahead or {})
-    RowReader(session, shard, name, threading.Event()).bring_up(rows)
-    contents = gather((rows[number] for number in sorted(rows)), name)
-    if contents.batch != batch:
-        refuse(name, f"is damaged: its newest row is of batch {contents.batch}, not {batch}")
+    rows = ahead or Rows()
+    newest = RowReader(session, shard, name, threading.Event()).bring_up(rows)
+    if newest != batch:
+        refuse(name, f"is damaged: its newest row is of batch {newest}, not {batch}")
+    contents = rows.contents(name)
+    contents.batch = batch  # a row of a later one may have gone with a lost primary
     return contents

@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.errors import StoreError
+from enact_dist.link.postgres.address import StandbyFigures
 
 if TYPE_CHECKING:
     from enact_dist.link.postgres.connection import DatabaseSession
@@ -120,14 +121,22 @@ SELECT id, name, epoch, batch, beat, holder FROM enact.shard WHERE cell = %b ORD
 NAME_ME: Final = "SELECT set_config('application_name', %s, false)"
 STANDBYS: Final = """
 SELECT application_name FROM pg_stat_activity WHERE datname = current_database()
-    AND application_name ~ '^enact-standby/[0-9]+/'
+    AND application_name ~ '^enact-standby/[0-9.]+/'
 ORDER BY backend_start
 """
 
 
-def name_of_standby(shard: int, who: str) -> str:
+def name_of_standby(shard: int, who: str, figures: StandbyFigures) -> str:
     """Return the name under which a standby's connection stands in `STANDBYS`."""
-    return f"enact-standby/{shard}/{who}"
+    counted = ".".join(map(str, (shard, *figures))) if any(figures) else str(shard)
+    return f"enact-standby/{counted}/{who}"
+
+
+def read_standby(name: str) -> tuple[int, str, StandbyFigures]:
+    """Return the shard, process and figures that `name_of_standby` has put into a name."""
+    _, counted, who = name.split("/", 2)
+    shard, *figures = map(int, counted.split("."))
+    return shard, who, StandbyFigures(*figures)
 
 
 def state_of_shard(cell: str, shard: str) -> tuple[str, tuple[str, str]]:

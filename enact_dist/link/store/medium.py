@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from enact_dist.link.folder.folder import FolderFindings
     from enact_dist.link.folder.lock import FolderLock
     from enact_dist.link.store.database import DatabaseRow
-    from enact_dist.link.store.recovery import Contents
+    from enact_dist.link.store.gathering import Contents
 
 LOG_BYTES: Final = 8 << 20
 """Approximate size of the log at which it is carried into the database."""

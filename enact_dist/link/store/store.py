@@ -50,8 +50,8 @@ if TYPE_CHECKING:
 
     from enact_dist.core.protocol.records import Persist
     from enact_dist.link.folder.blobs import Blob
+    from enact_dist.link.store.gathering import Contents
     from enact_dist.link.store.media import Medium
-    from enact_dist.link.store.recovery import Contents
 
 FOLDER_MODE: Final = 0o700
 """A new data folder is private; an existing one keeps its owner's permissions."""
