@@ -157,8 +157,10 @@ def _writes(locks: Collection[LockRecord], anomalies: Iterable[Anomaly]) -> dict
     """Return what became of the locks that wrote."""
     found = Counter(anomaly.rule for anomaly in anomalies)
     return {
-        "acknowledged": sum(lock.tried and lock.told is LockOutcome.COMMITTED for lock in locks),
-        "unknown": sum(lock.tried and lock.told is LockOutcome.UNKNOWN for lock in locks),
+        "acknowledged": sum(
+            bool(lock.writes) and lock.told is LockOutcome.COMMITTED for lock in locks
+        ),
+        "unknown": sum(bool(lock.writes) and lock.told is LockOutcome.UNKNOWN for lock in locks),
         **{word: sum(found[rule] for rule in rules) for word, rules in _WRONG.items()},
     }
 

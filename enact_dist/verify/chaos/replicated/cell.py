@@ -32,6 +32,8 @@ LOST: Final = {
     "the database warned": "the database warned",
     "SQLSTATE 53": "the database's disk is full",
 }
+_AWAY: Final = "and the shard ends: what it has not acknowledged"
+"""Last words of a daemon that is ended in good order while the database cannot be reached."""
 """Why a daemon may end by itself: what its last words contain, and what the report calls it."""
 UNEXPECTED_END: Final = "a daemon ended for no reason that it may have"
 
@@ -178,10 +180,10 @@ class ReplicatedCell(TestedCell):
 
     def _note_end(self, place: Place, process: LineProcess) -> None:
         status = process.status
-        if place.ordered and status in (0, -signal.SIGKILL):
-            return
         log = (self._folder / f"{place.name}.output").read_text(errors="replace")
         said = last_said(log[-LOG_BYTES:])
+        if place.ordered and (status in (0, -signal.SIGKILL) or _AWAY in said):
+            return
         why = next((why for text, why in LOST.items() if status == 1 and text in said), "")
         self._log.write("end", place.name, status, why or said, time.monotonic_ns())
         if not why:

@@ -88,9 +88,9 @@ class DatabaseFaults:
 
     def close(self) -> None:
         """End the servers."""
-        self._pair.close()
+        self._pair.end()
         self._thread.shutdown(wait=True, cancel_futures=True)
-        self._pair.close()
+        self._pair.end()  # one that was just being started
 
     # ---------------------------------------------------------------- faults
 

@@ -79,6 +79,9 @@ class DatabaseNode:
         hosts: Has a host of its name.
         name: Of the server and its host.
         folder: Gets its output.
+
+    Attributes:
+        ended: Whether it is never to start again.
     """
 
     def __init__(self, hosts: Namespaces, name: str, folder: Path) -> None:
@@ -86,6 +89,7 @@ class DatabaseNode:
         self._hosts, self._output = hosts, folder / f"{name}.output"
         self._programs = programs()
         self._process: subprocess.Popen[bytes] | None = None
+        self.ended = False
         disk = f"size={DISK_MB}m"
         hosts.execute(name, "mount", "-t", "tmpfs", "-o", disk, "tmpfs", "/mnt")
         hosts.execute(name, "mkdir", "/mnt/data", "/mnt/log")
@@ -132,14 +136,14 @@ class DatabaseNode:
         where = ("-D", "/mnt/data/db", "--waldir=/mnt/log/wal")
         self._make("pg_basebackup", "-d", source, *where, "-R", "-c", "fast", "--no-sync")
 
-    def start(self) -> None:
+    def start(self, timeout_s: float = WAIT_S) -> None:
         """Start it; return once it answers.
 
         Raises:
             LinkError: It does not.
         """
-        end_s = time.monotonic() + WAIT_S
-        while True:
+        end_s = time.monotonic() + timeout_s
+        while not self.ended:
             if self._process is None or self._process.poll() is not None:
                 # After a kill, its children keep the folder for a moment.
                 with self._output.open("ab") as output:
@@ -155,17 +159,18 @@ class DatabaseNode:
             if time.monotonic() > end_s:
                 raise LinkError(f"the database server {self.name} does not start")
             time.sleep(POLL_S)
-
-    @property
-    def runs(self) -> bool:
-        """Whether its first process runs."""
-        return self._process is not None and self._process.poll() is None
+        raise LinkError(f"the database server {self.name} is not to start any more")
 
     def kill(self) -> None:
         """SIGKILL its first process, whose children then end by themselves."""
         if self._process is not None:
             self._process.kill()
             self._process.wait()
+
+    def end(self) -> None:
+        """Kill it for good; idempotent."""
+        self.ended = True
+        self.kill()
 
     def _pids(self) -> list[int]:
         assert self._process is not None
@@ -178,7 +183,7 @@ class DatabaseNode:
 
     def signal(self, number: int) -> None:
         """Send a signal to all its processes, the first one before its children."""
-        for pid in self._pids()[:1] + self._pids()[1:]:
+        for pid in self._pids():
             with suppress(ProcessLookupError):
                 os.kill(pid, number)
 
@@ -262,16 +267,16 @@ class Pair:
         """
         self.primary.start()
         end_s = time.monotonic() + WAIT_S
-        while time.monotonic() < end_s:
-            if self._is_whole():
-                return
+        while time.monotonic() < end_s and not self.standby.ended:
+            with suppress(LinkError):
+                self.standby.start(AWAY_S)
+                if self._is_whole():
+                    return
             self.standby.kill()
             self.standby.copy(self.primary)
         raise LinkError("the database's standby confirms no commits")
 
     def _is_whole(self) -> bool:
-        with suppress(LinkError):
-            self.standby.start()
         end_s = time.monotonic() + AWAY_S
         named = False
         while time.monotonic() < end_s:
@@ -293,7 +298,7 @@ class Pair:
             time.sleep(POLL_S)
         return []
 
-    def close(self) -> None:
-        """Kill both."""
+    def end(self) -> None:
+        """Kill both for good; idempotent."""
         for node in (self.primary, self.standby):
-            node.kill()
+            node.end()

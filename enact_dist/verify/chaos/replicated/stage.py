@@ -86,7 +86,7 @@ def stage_replicated(
         hosts.missing += ("faults of the database (it is not the run's own)",)
         cuts = SharedCuts(hosts)
         name = f"chaos-{os.getpid()}-{time.time_ns()}"
-        undo.callback(_forget, store, name)
+        undo.callback(_leave_nothing, store, name, log)
         _forget(store, name)
     cell = ReplicatedCell(
         folder,
@@ -115,6 +115,14 @@ def stage_replicated(
         database=database,
     )
     return Staged(hosts, cell, injector)
+
+
+def _leave_nothing(store: str, cell: str, log: Journal) -> None:
+    """Remove a cell at its end."""
+    try:
+        _forget(store, cell)
+    except LinkError as error:
+        log.write("failure", "the rows of the cell are left in the database", f"{cell}: {error}")
 
 
 def _forget(store: str, cell: str) -> None:
