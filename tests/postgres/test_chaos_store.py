@@ -2,13 +2,17 @@
 
 import json
 import os
+from pathlib import Path
 
 import pytest
 
 from enact_dist.cli.main import main
+from enact_dist.verify.chaos import evidence, runner
+from enact_dist.verify.chaos.figures import judge
 from enact_dist.verify.chaos.replicated import faults
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.sampled(1)]
+ATTEMPTS = 6
 SECONDS = float(os.environ.get("ENACT_CHAOS_STORE_SECONDS", "10"))
 
 
@@ -29,3 +33,26 @@ def test_nothing_is_lost_and_nothing_is_left(server, tmp_path, capsys):
     assert told["late_answers"] == 0
     left = "SELECT count(*) FROM enact.shard WHERE cell LIKE 'chaos-%%'"
     assert server.execute(left) == [(0,)]
+
+
+def test_answers_after_a_lease_are_caught(server, tmp_path, monkeypatch):
+    """Daemons whose lease never ends, stopped until another one serves: what they answer is seen.
+
+    One that learns of its successor first ends without an answer; then the same happens again.
+    """
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)
+    deck = {faults.WAKE_OLD: 1}
+    for attempt in range(ATTEMPTS):
+        folder = tmp_path / str(attempt)
+        folder.mkdir()
+        settings = runner.ChaosSettings(
+            SECONDS, attempt, 1, 4, daemon_module="ungated_daemon", deck=deck, store=server.url
+        )
+        runner.run(settings, folder, progress=lambda *_: None)
+        verdict = judge(evidence.load(folder))
+        if verdict.late_answers:
+            break
+
+    assert verdict.takeovers
+    assert verdict.late_answers
+    assert "an old daemon answered after its lease" in {a.rule for a in verdict.anomalies}

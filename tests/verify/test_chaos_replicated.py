@@ -7,12 +7,12 @@ from types import SimpleNamespace
 
 import pytest
 
-from enact_dist.errors import LinkError
-from enact_dist.verify.chaos import evidence, figures, watcher
+from enact_dist.errors import ConfigError, LinkError
+from enact_dist.verify.chaos import evidence, figures, runner, watcher
 from enact_dist.verify.chaos.journal import Journal
 from enact_dist.verify.chaos.network.hosts import Loopback
 from enact_dist.verify.chaos.replicated.answers import AnswerTimes, read_answers
-from enact_dist.verify.chaos.replicated.cell import UNEXPECTED_END, ReplicatedCell
+from enact_dist.verify.chaos.replicated.cell import AS_ORDERED, UNEXPECTED_END, ReplicatedCell
 from enact_dist.verify.chaos.replicated.faults import SharedCuts, ways_between
 from enact_dist.verify.chaos.replicated.stage import _forget
 
@@ -86,8 +86,11 @@ def test_ring_keeps_the_newest_answers(tmp_path):
         (False, 1, "KeyError: 'x'", ""),
         (False, -signal.SIGSEGV, "s0 has another holder since epoch 4", ""),
         (False, 0, "", ""),
-        (True, -signal.SIGKILL, "", None),
-        (True, 0, "", None),
+        (True, -signal.SIGKILL, "", AS_ORDERED),
+        (True, 0, "", AS_ORDERED),
+        (True, 1, "the shard ends: what it has not acknowledged may be lost", ""),
+        (True, 1, "no answer, and the shard ends: what it has not acknowledged", AS_ORDERED),
+        (False, 1, "no answer, and the shard ends: what it has not acknowledged", ""),
         (True, 1, "KeyError: 'x'", ""),
     ],
 )
@@ -106,8 +109,8 @@ def test_end_of_a_daemon_is_an_anomaly_unless_it_may_end_so(tmp_path, ordered, s
     noted = [line[3] for line in lines if line[0] == "end"]
     rules = [line[1] for line in lines if line[0] == "failure"]
 
-    assert noted == ([] if why is None else [why or said])
-    assert rules == ([UNEXPECTED_END] if why == "" else [])
+    assert noted == [why or said]
+    assert rules == ([] if why else [UNEXPECTED_END])
 
 
 def test_way_opens_with_the_last_of_its_cuts():
@@ -131,3 +134,11 @@ def test_store_that_cannot_be_used_is_named_without_its_password():
     with pytest.raises(LinkError, match=r"postgresql://me@127\.0\.0\.1:9/x: ") as found:
         _forget("postgresql://me:secret@127.0.0.1:9/x", "chaos")
     assert "secret" not in str(found.value)
+
+
+def test_namespaces_cannot_be_required_for_a_database_of_others(tmp_path):
+    settings = runner.ChaosSettings(
+        1.0, 1, namespaces_required=True, store="postgresql://me@127.0.0.1:9/x"
+    )
+    with pytest.raises(ConfigError, match="say --store nodes"):
+        runner.run(settings, tmp_path, progress=lambda *_: None)

@@ -102,7 +102,7 @@ class Doubt:
 
 @dataclass(frozen=True, slots=True)
 class DaemonEnd:
-    """A daemon of a cell in a database that ended by itself."""
+    """The end of a daemon of a cell in a database."""
 
     place: str
     status: int

@@ -88,7 +88,7 @@ class Verdict:
         guessed: Versions that one of several locks wrote and no lock saw.
         writes: Locks that wrote: acknowledged, of unknown outcome; anomalies of writes by kind.
         takeovers: Of a cell in a database: how often a daemon took a shard over.
-        ended: Why daemons of such a cell ended by themselves.
+        ended: Why daemons of such a cell ended.
         answers: How many answers they let out; `late_answers`: those of them that went out after
             the database had been asked for the shard's next epoch.
     """
@@ -173,7 +173,9 @@ def _answers(evidence: Evidence) -> tuple[int, list[Anomaly]]:
         begun.setdefault(restart.shard, []).append((restart.epoch, restart.started_ns))
     for shard, served in evidence.served.items():
         for one in served:
-            since_ns = min((ns for epoch, ns in begun[shard] if epoch > one.epoch), default=None)
+            since_ns = min(
+                (ns for epoch, ns in begun.get(shard, ()) if epoch > one.epoch), default=None
+            )
             late += [
                 Anomaly(
                     "an old daemon answered after its lease",

@@ -17,7 +17,8 @@ from enact_dist.verify.chaos.evidence import FAULTS, SETTINGS
 from enact_dist.verify.chaos.faults import DECK, FaultInjector, Staged
 from enact_dist.verify.chaos.journal import Journal
 from enact_dist.verify.chaos.network.hosts import open_hosts
-from enact_dist.verify.chaos.replicated.stage import stage_replicated
+from enact_dist.verify.chaos.replicated import daemon as replicated_daemon
+from enact_dist.verify.chaos.replicated.stage import NODES, stage_replicated
 from enact_dist.verify.checker import LockOutcome
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ class ChaosSettings:
         seconds: How long faults happen.
         seed: What faults and clients are drawn from.
         namespaces_required: Whether to fail where there are no network namespaces.
-        daemon_module: Runs a shard; tests put a broken one in its place.
+        daemon_module: Runs a shard; tests put a broken one in its place.  "": as usual.
         deck: How many faults of each kind come in turn; None: as usual.
         store: Address of a database that keeps the shards, `NODES`: two servers of the run's own,
             "": folders do.
@@ -51,7 +52,7 @@ class ChaosSettings:
     shards: int = 3
     actors: int = 8
     namespaces_required: bool = False
-    daemon_module: str = daemon.MODULE
+    daemon_module: str = ""
     deck: Mapping[str, int] | None = None
     store: str = ""
 
@@ -65,7 +66,7 @@ def run(settings: ChaosSettings, folder: Path, *, progress: Callable[[str, float
         progress: Gets what is being done, and how many seconds of faults are left.
 
     Raises:
-        ConfigError: The folder is not empty.
+        ConfigError: The folder is not empty, or the settings exclude each other.
         LinkError: Namespaces are required and cannot be made, or the database cannot be used.
     """
     if any(folder.iterdir()):
@@ -112,6 +113,11 @@ def _stage(
     """Make the hosts, the cell, and what harms them."""
     seed = settings.seed
     if settings.store:
+        if settings.namespaces_required and settings.store != NODES:
+            raise ConfigError(
+                "--require-namespaces: no network of a run leads to the database of --store;"
+                " leave one of them out, or say --store nodes"
+            )
         return stage_replicated(
             settings.store,
             folder,
@@ -123,11 +129,12 @@ def _stage(
             seed=seed,
             ttl_s=TTL_S,
             deck=settings.deck,
+            daemon_module=settings.daemon_module or replicated_daemon.MODULE,
         )
     required = settings.namespaces_required
     hosts = open_hosts((*shards, *groups, WATCHER_HOST), seed=seed, required=required)
     undo.callback(hosts.close)
-    module = settings.daemon_module
+    module = settings.daemon_module or daemon.MODULE
     cell = TestedCell(folder, hosts, shards, log, ttl_s=TTL_S, seed=seed, daemon_module=module)
     undo.callback(cell.close)
     deck = settings.deck or DECK

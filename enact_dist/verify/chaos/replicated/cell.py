@@ -35,6 +35,7 @@ LOST: Final = {
 _AWAY: Final = "and the shard ends: what it has not acknowledged"
 """Last words of a daemon that is ended in good order while the database cannot be reached."""
 """Why a daemon may end by itself: what its last words contain, and what the report calls it."""
+AS_ORDERED: Final = "as ordered"
 UNEXPECTED_END: Final = "a daemon ended for no reason that it may have"
 
 
@@ -90,12 +91,15 @@ class ReplicatedCell(TestedCell):
         cell: str,
         places: tuple[str, ...],
         lease_s: float,
+        daemon_module: str = daemon.MODULE,
     ) -> None:
         self._places, self._store, self._lease_s, self._name = places, store, lease_s, cell
         self.places: dict[str, Place] = {}
         self._keeping = threading.Lock()
         self._closing = threading.Event()
-        super().__init__(folder, hosts, shards, log, ttl_s=ttl_s, seed=seed)
+        super().__init__(
+            folder, hosts, shards, log, ttl_s=ttl_s, seed=seed, daemon_module=daemon_module
+        )
 
     def _write_file(self, shards: tuple[str, ...]) -> None:
         listen = {
@@ -135,8 +139,8 @@ class ReplicatedCell(TestedCell):
                 if self._closing.is_set():
                     return
                 process = place.process = self._start(place)
-            started_ns = time.monotonic_ns()
-            self._listen(place, process, started_ns)
+            self._log.write("start", place.name, place.starts, time.monotonic_ns())
+            self._listen(place, process)
             if self._closing.is_set():
                 return
             self._note_end(place, process)
@@ -150,9 +154,9 @@ class ReplicatedCell(TestedCell):
         ahead_ns = str(self._hosts.clock_ahead_ns[place.host])
         what = ("shard", "run", place.shard, "--cell", str(self.file), "--standby")
         words = (ahead_ns, str(answers), *what, "--listen", place.listen)
-        return self._run(daemon.MODULE, words, place.name, place.host)
+        return self._run(self._module, words, place.name, place.host)
 
-    def _listen(self, place: Place, process: LineProcess, started_ns: int) -> None:
+    def _listen(self, place: Place, process: LineProcess) -> None:
         """Take note of what a daemon says until it ends."""
         epoch = fenced_ns = ready_ns = 0
         while True:
@@ -182,9 +186,9 @@ class ReplicatedCell(TestedCell):
         status = process.status
         log = (self._folder / f"{place.name}.output").read_text(errors="replace")
         said = last_said(log[-LOG_BYTES:])
-        if place.ordered and (status in (0, -signal.SIGKILL) or _AWAY in said):
-            return
         why = next((why for text, why in LOST.items() if status == 1 and text in said), "")
+        if place.ordered and (status in (0, -signal.SIGKILL) or _AWAY in said):
+            why = AS_ORDERED
         self._log.write("end", place.name, status, why or said, time.monotonic_ns())
         if not why:
             self._log.write("failure", UNEXPECTED_END, f"{place.name}: {status}: {said}")

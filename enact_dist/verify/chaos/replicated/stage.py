@@ -47,6 +47,7 @@ def stage_replicated(
     seed: int,
     ttl_s: float,
     deck: Mapping[str, int] | None,
+    daemon_module: str,
 ) -> Staged:
     """Make hosts and a cell whose shards store in a database.
 
@@ -61,6 +62,7 @@ def stage_replicated(
         seed: What happens is drawn from it.
         ttl_s: Session TTL.
         deck: How many faults of each kind come in turn; None: as usual.
+        daemon_module: Runs a shard.
 
     Raises:
         LinkError: The database cannot be used, or the system allows no namespaces.
@@ -99,6 +101,7 @@ def stage_replicated(
         cell=name,
         places=_PLACES,
         lease_s=LEASE_S,
+        daemon_module=daemon_module,
     )
     undo.callback(cell.close)
     injector = ReplicatedFaults(
