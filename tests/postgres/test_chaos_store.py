@@ -11,7 +11,7 @@ from enact_dist.verify.chaos import evidence, runner
 from enact_dist.verify.chaos.figures import judge
 from enact_dist.verify.chaos.replicated import faults
 
-pytestmark = [pytest.mark.slow, pytest.mark.sampled(1)]
+pytestmark = [pytest.mark.slow, pytest.mark.sampled(1, of="file")]
 ATTEMPTS = 6
 SECONDS = float(os.environ.get("ENACT_CHAOS_STORE_SECONDS", "10"))
 

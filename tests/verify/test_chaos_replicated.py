@@ -84,6 +84,7 @@ def test_ring_keeps_the_newest_answers(tmp_path):
         (False, 1, "the database warned (01000 canceling …)", "the database warned"),
         (False, 1, "could not extend file (SQLSTATE 53100)", "the database's disk is full"),
         (False, 1, "KeyError: 'x'", ""),
+        (False, 1, "now CRITICAL the database warned\nit ends", "the database warned"),
         (False, -signal.SIGSEGV, "s0 has another holder since epoch 4", ""),
         (False, 0, "", ""),
         (True, -signal.SIGKILL, "", AS_ORDERED),
@@ -103,7 +104,8 @@ def test_end_of_a_daemon_is_an_anomaly_unless_it_may_end_so(tmp_path, ordered, s
         )  # fmt: skip
         place = cell.places["s0@h0"]
         place.ordered = ordered
-        (tmp_path / "s0@h0.output").write_text(said + "\n")
+        (tmp_path / "s0@h0.output").write_text(f"KeyError: of one before\n{said}\n")
+        place.logged = len("KeyError: of one before\n")
         cell._note_end(place, SimpleNamespace(status=status))
     lines = [json.loads(line) for line in (tmp_path / evidence.FAULTS).read_text().splitlines()]
     noted = [line[3] for line in lines if line[0] == "end"]

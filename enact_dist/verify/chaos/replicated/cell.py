@@ -32,6 +32,7 @@ LOST: Final = {
     "the database warned": "the database warned",
     "SQLSTATE 53": "the database's disk is full",
 }
+_CRITICAL: Final = " CRITICAL "
 _AWAY: Final = "and the shard ends: what it has not acknowledged"
 """Last words of a daemon that is ended in good order while the database cannot be reached."""
 """Why a daemon may end by itself: what its last words contain, and what the report calls it."""
@@ -48,6 +49,7 @@ class Place:
         serves: Whether it serves.
         pause_s: When the next one is started once this one has ended.
         ordered: Whether its end was wanted.
+        logged: How long the log of its predecessors is.
     """
 
     shard: str
@@ -58,6 +60,7 @@ class Place:
     pause_s: float = AGAIN_S
     ordered: bool = False
     starts: int = 0
+    logged: int = 0
     process: LineProcess | None = None
 
     @property
@@ -150,6 +153,7 @@ class ReplicatedCell(TestedCell):
 
     def _start(self, place: Place) -> LineProcess:
         place.starts += 1
+        place.logged = log.stat().st_size if (log := self._output(place)).exists() else 0
         answers = self._folder / f"{place.name}.{place.starts}{SUFFIX}"
         ahead_ns = str(self._hosts.clock_ahead_ns[place.host])
         what = ("shard", "run", place.shard, "--cell", str(self.file), "--standby")
@@ -179,13 +183,17 @@ class ReplicatedCell(TestedCell):
         if epoch and not ready_ns:
             self._note_takeover(place, epoch, fenced_ns, time.monotonic_ns())
 
+    def _output(self, place: Place) -> Path:
+        return self._folder / f"{place.name}.output"
+
     def _note_takeover(self, place: Place, epoch: int, fenced_ns: int, ready_ns: int) -> None:
         self._log.write("restart", place.shard, epoch, fenced_ns, fenced_ns, ready_ns, ready_ns)
 
     def _note_end(self, place: Place, process: LineProcess) -> None:
         status = process.status
-        log = (self._folder / f"{place.name}.output").read_text(errors="replace")
-        said = last_said(log[-LOG_BYTES:])
+        log = self._output(place).read_bytes()[place.logged :].decode(errors="replace")
+        stops = [line for line in log.splitlines() if _CRITICAL in line]
+        said = stops[-1] if stops else last_said(log[-LOG_BYTES:])
         why = next((why for text, why in LOST.items() if status == 1 and text in said), "")
         if place.ordered and (status in (0, -signal.SIGKILL) or _AWAY in said):
             why = AS_ORDERED
