@@ -51,6 +51,11 @@ _CHAOS: Final = OptionGroup("real daemons and clients", (
     counted("--shards", "number of shards (default: 3)", 3),
     counted("--actors", "number of actors (default: 8)", 8),
     file_of("--keep", "FOLDER", "a new folder that keeps journals and data"),
+    option("--store", "URL",
+           "keep the shards in this database, with a standby daemon for each, and leave nothing"
+           " there; `nodes`: in two servers of PostgreSQL on hosts of their own, which meet faults,"
+           " too (needs root and namespaces)",
+           default=""),
     flag("--require-namespaces",
          "fail where there are no namespaces, instead of leaving out what needs a network"),
 ))  # fmt: skip
@@ -73,6 +78,7 @@ VERBS: Final = (
         "enact verify --seed 17\n"
         "enact verify --recovery\n"
         "enact verify --chaos --minutes 5\n"
+        "enact verify --chaos --store nodes --shards 2 --minutes 5\n"
         "enact verify --floods --json\n"
         "enact verify --frames --minutes 10\n"
         "enact verify --takeover --minutes 10",

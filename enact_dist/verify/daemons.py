@@ -195,9 +195,10 @@ def write_cell(
     worlds: Sequence[str],
     listen: Mapping[str, str],
     pins: Mapping[str, str],
+    advertise: Mapping[str, Sequence[str]] | None = None,
     **options: object,
 ) -> None:
-    """Write the file of a throw-away cell, whose data lie beside it.
+    """Write the file of a throw-away cell, whose data lie beside it unless it has a `store`.
 
     Args:
         file: Where.
@@ -205,12 +206,17 @@ def write_cell(
         worlds: Its world contexts.
         listen: Shard → the endpoint at which it listens.
         pins: Entity pattern → shard.
+        advertise: Shard → where it can be reached, if not where it listens.
         options: Further keys of the file.
     """
-    keys = {"name": name, "worlds": list(worlds), "data_folder": str(file.parent / "data")}
+    keys: dict[str, object] = {"name": name, "worlds": list(worlds)}
+    if "store" not in options:
+        keys["data_folder"] = str(file.parent / "data")
     lines = [f"{key} = {json.dumps(value)}" for key, value in (keys | options).items()]
     for shard, endpoint in listen.items():
         lines += [f"[shards.{shard}]", f"listen = {json.dumps(endpoint)}"]
+        if advertise is not None:
+            lines.append(f"advertise = {json.dumps(advertise[shard])}")
     for pattern, shard in pins.items():
         lines += ["[[pins]]", f"entities = {json.dumps(pattern)}", f'shard = "{shard}"']
     file.write_text("\n".join(lines) + "\n")

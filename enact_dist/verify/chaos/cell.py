@@ -86,13 +86,16 @@ class TestedCell(Processes):
         self.shards: dict[str, ShardProcess] = {}
         self.clients: dict[str, StartedClient] = {}
         self.watcher: LineProcess
+        self._write_file(shards)
+
+    def _write_file(self, shards: tuple[str, ...]) -> None:
         write_cell(
             self.file,
             "chaos",
             worlds=WORLDS,
-            listen={name: hosts.endpoint(name) for name in shards},
+            listen={name: self._hosts.endpoint(name) for name in shards},
             pins={f"thing/{name}/*": name for name in shards},
-            session_ttl_s=ttl_s,
+            session_ttl_s=self._ttl_s,
         )
 
     # ---------------------------------------------------------------- starts
@@ -180,6 +183,16 @@ class TestedCell(Processes):
         return self.run(module, words, log, before=self._hosts.before(host))
 
     # ---------------------------------------------------------------- ends
+
+    def end_shards(self) -> None:
+        """End all daemons in good order, and take note of those that do not."""
+        for shard in self.shards.values():
+            shard.ready.clear()
+            shard.process.signal(signal.SIGTERM)
+        for name, shard in self.shards.items():
+            status = shard.process.wait_status(END_S)
+            if status != 0:
+                self._log.write("failure", "a shard does not end well", f"{name}: {status}")
 
     def check(self) -> None:
         """Raise if a process ended by itself.

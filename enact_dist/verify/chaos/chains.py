@@ -157,7 +157,7 @@ class CheckedHistory:
         for one, then in pairwise(restarts):
             if view.granted_ns is not None and view.granted_ns <= then.started_ns:
                 return one.epoch
-            if view.begun_ns < then.down_ns:
+            if view.begun_ns < then.silent_ns:
                 return None
         return restarts[-1].epoch
 

@@ -37,6 +37,7 @@ def run_chaos(arguments: argparse.Namespace) -> int:
         arguments.shards,
         arguments.actors,
         namespaces_required=arguments.require_namespaces,
+        store=arguments.store,
     )
     kept = arguments.keep
     if kept is not None:
@@ -95,6 +96,7 @@ def _print(verdict: Verdict) -> None:
     print(
         f"{settings['seconds']:.0f} s, seed {settings['seed']}, {settings['shards']} shards,"
         f" {settings['actors']} actors, TTL {settings['ttl_s']:g} s"
+        + (f", store {settings['store']}" if settings.get("store") else "")
     )
     for name in verdict.missing:
         print(f"left out: {name}")
@@ -108,6 +110,14 @@ def _print(verdict: Verdict) -> None:
         ("fenced zombies", verdict.fenced),
         ("epoch changes", verdict.epoch_changes),
     ]
+    if settings.get("store"):
+        rows += [
+            ("takeovers", verdict.takeovers),
+            ("answers of daemons", verdict.answers),
+            ("of them after the end of a lease", verdict.late_answers),
+        ]
+        rows += [(f"daemons that ended: {name}", n) for name, n in verdict.ended.items()]
+    rows += [(f"writes: {name}", n) for name, n in verdict.writes.items()]
     rows += [(f"outcome: {name}", n) for name, n in verdict.outcomes.items()]
     rows += [(f"shards: {name}", n) for name, n in verdict.counters.items()]
     rows += [("unseen versions, of several possible writers", verdict.guessed)]

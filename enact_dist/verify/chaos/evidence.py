@@ -5,6 +5,7 @@
     settings.json       what was run
     faults.log          faults and restarts, by the runner
     watcher.log         locks in doubt and counters, by the watcher
+    NAME.answers        when a daemon of a cell in a database answered, and in which epoch
     NAME.journal        what a client process did; `final.journal`: everything, read at the end
     *.log, data/        output of the processes, data of the shards
 """
@@ -12,16 +13,20 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.errors import ConfigError
 from enact_dist.verify.chaos import watcher
 from enact_dist.verify.chaos.journal import SUFFIX, read_lines
+from enact_dist.verify.chaos.replicated.answers import SUFFIX as ANSWERS
+from enact_dist.verify.chaos.replicated.answers import read_answers
 from enact_dist.verify.checker import LockOutcome
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from enact_dist.verify.chaos.replicated.answers import ServedEpoch
 
 SETTINGS: Final = "settings.json"
 FAULTS: Final = "faults.log"
@@ -59,13 +64,20 @@ class LockRecord:
 
 @dataclass(frozen=True, slots=True)
 class Restart:
-    """One start of a shard; `down_ns` is when its predecessor ended, 0 for the first."""
+    """One start of a shard, or a takeover by a daemon that stood by.
+
+    Attributes:
+        down_ns: When its predecessor ended, or when the database was asked for the shard; 0 for the
+            first.
+        silent_ns: When its predecessor answered no more at the latest.
+    """
 
     shard: str
     epoch: int
     down_ns: int
     started_ns: int
     ready_ns: int
+    silent_ns: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,9 +100,23 @@ class Doubt:
     last_ns: int
 
 
+@dataclass(frozen=True, slots=True)
+class DaemonEnd:
+    """The end of a daemon of a cell in a database."""
+
+    place: str
+    status: int
+    why: str
+    at_ns: int
+
+
 @dataclass(slots=True)
 class Evidence:
-    """All that is known of a run."""
+    """All that is known of a run.
+
+    Attributes:
+        served: Shard → what each of its daemons answered, in a cell in a database.
+    """
 
     settings: dict[str, Any]
     locks: dict[str, LockRecord] = field(default_factory=dict)
@@ -98,6 +124,8 @@ class Evidence:
     faults: list[Fault] = field(default_factory=list)
     doubts: list[Doubt] = field(default_factory=list)
     counters: dict[tuple[str, int], dict[str, int]] = field(default_factory=dict)
+    ends: list[DaemonEnd] = field(default_factory=list)
+    served: dict[str, list[ServedEpoch]] = field(default_factory=dict)
     failures: list[tuple[str, str]] = field(default_factory=list)
     """What went wrong while it ran: rule, text."""
 
@@ -118,6 +146,9 @@ def load(folder: Path) -> Evidence:
             _read_journal(path, evidence)
         _read_faults(folder, evidence)
         _read_watcher(folder, evidence)
+        for path in sorted(folder.glob(f"*{ANSWERS}")):
+            shard = path.name.partition("@")[0]
+            evidence.served.setdefault(shard, []).append(read_answers(path))
     except (OSError, ValueError, KeyError) as error:
         raise ConfigError(f"{folder} is no folder of a chaos run: {error}") from error
     return evidence
@@ -148,13 +179,24 @@ def _read_journal(path: Path, evidence: Evidence) -> None:
 def _read_faults(folder: Path, evidence: Evidence) -> None:
     for word, *rest in read_lines(folder / FAULTS):
         if word == "restart":
-            evidence.restarts.append(Restart(*rest))
+            shard, epoch, down_ns, started_ns, ready_ns, *silent = rest
+            silent_ns = silent[0] if silent else down_ns
+            restart = Restart(shard, epoch, down_ns, started_ns, ready_ns, silent_ns)
+            evidence.restarts.append(restart)
+        elif word == "end":
+            evidence.ends.append(DaemonEnd(*rest))
         elif word == "fault":
             kind, targets, from_ns, until_ns = rest
             evidence.faults.append(Fault(kind, tuple(targets), from_ns, until_ns))
         elif word == "failure":
             rule, text = rest
             evidence.failures.append((rule, text))
+    evidence.restarts.sort(key=lambda restart: restart.epoch)
+    first: dict[str, None] = {}
+    for index, restart in enumerate(evidence.restarts):
+        if restart.shard not in first:
+            first[restart.shard] = None
+            evidence.restarts[index] = replace(restart, down_ns=0, silent_ns=0)
 
 
 def _read_watcher(folder: Path, evidence: Evidence) -> None:

@@ -24,7 +24,8 @@ import os
 import random
 import signal
 import time
-from typing import TYPE_CHECKING, Final
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Final
 
 from enact_dist.errors import LinkError
 from enact_dist.verify.chaos.cell import END_S
@@ -75,7 +76,12 @@ class FaultInjector:
         seed: What happens is drawn from it, as far as the moments repeat.
         ttl_s: Session TTL.
         deck: How many cards of each kind.
+
+    Attributes:
+        network_kinds: What needs a network of the run's own.
     """
+
+    network_kinds: ClassVar = frozenset((PARTITION, ONE_WAY, SLOW, LOSSY))
 
     def __init__(
         self,
@@ -99,7 +105,7 @@ class FaultInjector:
         self._cards = [
             kind
             for kind, count in deck.items()
-            if apart or kind not in (PARTITION, ONE_WAY, SLOW, LOSSY)
+            if apart or kind not in self.network_kinds
             for _ in range(count)
         ]
 
@@ -139,7 +145,12 @@ class FaultInjector:
             self._deck = list(self._cards)
             self._draw.shuffle(self._deck)
         kind = self._deck.pop()
-        carried_out: dict[str, Callable[[], bool]] = {
+        if not self._kinds()[kind]():
+            self._deck.insert(self._draw.randint(0, len(self._deck)), kind)
+
+    def _kinds(self) -> dict[str, Callable[[], bool]]:
+        """Return what carries out a fault of each kind, if it can now."""
+        return {
             KILL_SHARD: self._kill_shard,
             KILL_CLIENT: self._kill_client,
             STOP_SHARD: lambda: self._stop(self._up(), STOP_SHARD),
@@ -151,8 +162,6 @@ class FaultInjector:
             SLOW: lambda: self._spoil(SLOW),
             LOSSY: lambda: self._spoil(LOSSY),
         }
-        if not carried_out[kind]():
-            self._deck.insert(self._draw.randint(0, len(self._deck)), kind)
 
     def _free(self, names: list[str]) -> str | None:
         """Draw one of `names` that nothing is being done to."""
@@ -310,7 +319,7 @@ class FaultInjector:
             return False
         self._busy.add(kind)
         draw = self._draw
-        host = draw.choice((*self._groups, *self._cell.shards))
+        host = draw.choice(self._cabled())
         if kind == SLOW:
             delay_s = draw.uniform(*DELAY_S)
             cable = Cable(delay_s, jitter_s=delay_s / 4)
@@ -327,8 +336,21 @@ class FaultInjector:
         self._after(draw.choice((1.0, 2.0, 4.0)) * self._ttl_s, mend)
         return True
 
+    def _cabled(self) -> tuple[str, ...]:
+        """Return the hosts whose cables may be spoiled."""
+        return (*self._groups, *self._cell.shards)
+
     def _lay(self, host: str, cable: Cable) -> None:
-        for other in (*self._groups, *self._cell.shards):
+        for other in self._cabled():
             if other != host:
                 self._hosts.lay(host, other, cable)
                 self._hosts.lay(other, host, cable)
+
+
+@dataclass(frozen=True, slots=True)
+class Staged:
+    """What a run starts, and what harms it."""
+
+    hosts: Hosts
+    cell: TestedCell
+    injector: FaultInjector

@@ -21,11 +21,12 @@ from enact_dist.verify.chaos.faults import (
     SLOW,
     STOP_CLIENT,
 )
+from enact_dist.verify.chaos.replicated.faults import KILL_SERVING, RESTART_SERVING, WAKE_OLD
 from enact_dist.verify.chaos.workload import UNEXPECTED
 from enact_dist.verify.checker import Anomaly, LockOutcome
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Collection, Iterable
 
     from enact_dist.verify.chaos.evidence import Evidence, Fault, LockRecord, Restart
 
@@ -46,6 +47,12 @@ COUNTED: Final = (
 )
 """Reported counters of the shards; the last half second of a killed shard is missing."""
 FACTS_MAX: Final = 20
+_WRONG: Final = {
+    "lost": ("told committed, but lost", "lost update", "half a commit"),
+    "doubled": ("one write stands twice", "one version was written twice"),
+    "invented": ("told not committed, but visible", "written by no lock", "versions have a gap"),
+}
+"""What the report calls anomalies of writes, and their rules."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +86,11 @@ class Verdict:
         commits: Locks with a confirmed commit; `reads`: those that only read.
         fenced: Commits that were sent and refused, since the lock was lost by then.
         guessed: Versions that one of several locks wrote and no lock saw.
+        writes: Locks that wrote: acknowledged, of unknown outcome; anomalies of writes by kind.
+        takeovers: Of a cell in a database: how often a daemon took a shard over.
+        ended: Why daemons of such a cell ended.
+        answers: How many answers they let out; `late_answers`: those of them that went out after
+            the database had been asked for the shard's next epoch.
     """
 
     settings: dict[str, Any]
@@ -95,6 +107,11 @@ class Verdict:
     recovery: dict[str, Spread]
     guessed: int
     views_checked: int
+    writes: dict[str, int]
+    takeovers: int
+    ended: dict[str, int]
+    answers: int
+    late_answers: int
     anomalies: list[Anomaly] = field(default_factory=list)
 
 
@@ -107,7 +124,10 @@ def judge(evidence: Evidence) -> Verdict:
     unexpected = Counter(lock.why for lock in locks if lock.why.startswith(UNEXPECTED))
     anomalies += [Anomaly(f"{n} times {why}", ()) for why, n in unexpected.items()]
     anomalies += [*history.oddities, *checker.anomalies()]
+    answers, late = _answers(evidence)
+    anomalies += late
     committed = [lock for lock in locks if lock.told is LockOutcome.COMMITTED]
+    takeovers = sum(restart.down_ns > 0 for restart in evidence.restarts)
     outcomes = Counter(lock.why or lock.told.value for lock in locks)
     return Verdict(
         settings=evidence.settings,
@@ -118,14 +138,53 @@ def judge(evidence: Evidence) -> Verdict:
         over_shards=sum(lock.kind == "write over shards" for lock in committed),
         reads=sum(not lock.writes for lock in committed),
         fenced=sum(lock.tried and lock.why == "LeaseLostError" for lock in locks),
-        epoch_changes=sum(restart.down_ns > 0 for restart in evidence.restarts),
+        epoch_changes=takeovers,
         outcomes=dict(sorted(outcomes.items())),
         counters={name: evidence.counter(name) for name in COUNTED},
         recovery=_recovery(evidence),
         guessed=len(history.guessed),
         views_checked=checker.views_checked,
+        writes=_writes(locks, anomalies),
+        takeovers=takeovers if evidence.served else 0,
+        ended=dict(sorted(Counter(end.why for end in evidence.ends).items())),
+        answers=answers,
+        late_answers=len(late),
         anomalies=anomalies,
     )
+
+
+def _writes(locks: Collection[LockRecord], anomalies: Iterable[Anomaly]) -> dict[str, int]:
+    """Return what became of the locks that wrote."""
+    found = Counter(anomaly.rule for anomaly in anomalies)
+    return {
+        "acknowledged": sum(
+            bool(lock.writes) and lock.told is LockOutcome.COMMITTED for lock in locks
+        ),
+        "unknown": sum(bool(lock.writes) and lock.told is LockOutcome.UNKNOWN for lock in locks),
+        **{word: sum(found[rule] for rule in rules) for word, rules in _WRONG.items()},
+    }
+
+
+def _answers(evidence: Evidence) -> tuple[int, list[Anomaly]]:
+    """Return how many answers daemons let out, and an anomaly for each that came late."""
+    late = []
+    begun: dict[str, list[tuple[int, int]]] = {}
+    for restart in evidence.restarts:
+        begun.setdefault(restart.shard, []).append((restart.epoch, restart.started_ns))
+    for shard, served in evidence.served.items():
+        for one in served:
+            since_ns = min(
+                (ns for epoch, ns in begun.get(shard, ()) if epoch > one.epoch), default=None
+            )
+            late += [
+                Anomaly(
+                    "an old daemon answered after its lease",
+                    (f"{shard}, epoch {one.epoch}: {(at_ns - since_ns) / 1e9:.3f} s too late",),
+                )
+                for at_ns in one.last_ns
+                if since_ns is not None and at_ns > since_ns
+            ]
+    return sum(one.answers for served in evidence.served.values() for one in served), late
 
 
 # ---------------------------------------------------------------- recovery
@@ -135,7 +194,7 @@ def _recovery(evidence: Evidence) -> dict[str, Spread]:
     ttl_ns = int(evidence.settings["ttl_s"] * 1e9)
     restarts = [(r, ns) for r in evidence.restarts if r.down_ns and (ns := _first(evidence, r))]
     quiet = [(r, ns) for r, ns in restarts if not _disturbed(evidence, r, ns, ttl_ns)]
-    return {
+    recovery = {
         "restart to first grant": spread(ns - r.started_ns for r, ns in restarts),
         "serving to first grant": spread(ns - r.ready_ns for r, ns in restarts),
         "restart to first grant, all clients alive": spread(ns - r.started_ns for r, ns in quiet),
@@ -143,6 +202,23 @@ def _recovery(evidence: Evidence) -> dict[str, Spread]:
         "holder killed to next grant": spread(_deaths(evidence, ttl_ns)),
         "in doubt": spread(_doubts(evidence)),
     }
+    if evidence.served:
+        for kind in (KILL_SERVING, WAKE_OLD, RESTART_SERVING):
+            recovery[f"{kind}: next grant"] = spread(_successions(evidence, kind))
+    return recovery
+
+
+def _successions(evidence: Evidence, kind: str) -> Iterable[int]:
+    """Yield how long after a fault of its daemon a shard granted its first lock in a new epoch."""
+    for fault in evidence.faults:
+        if fault.kind == kind:
+            firsts = (
+                _first(evidence, restart)
+                for restart in evidence.restarts
+                if restart.shard in fault.targets and restart.down_ns > fault.from_ns
+            )
+            if first_ns := next(filter(None, firsts), 0):
+                yield first_ns - fault.from_ns
 
 
 def _first(evidence: Evidence, restart: Restart) -> int:

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import time
-from dataclasses import dataclass, field
+from contextlib import ExitStack
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.config.types import without_password
 from enact_dist.errors import ConfigError, LinkError
 from enact_dist.verify.chaos import daemon
 from enact_dist.verify.chaos.cell import END_S, TestedCell
 from enact_dist.verify.chaos.evidence import FAULTS, SETTINGS
-from enact_dist.verify.chaos.faults import DECK, FaultInjector
+from enact_dist.verify.chaos.faults import DECK, FaultInjector, Staged
 from enact_dist.verify.chaos.journal import Journal
 from enact_dist.verify.chaos.network.hosts import open_hosts
+from enact_dist.verify.chaos.replicated import daemon as replicated_daemon
+from enact_dist.verify.chaos.replicated.stage import NODES, stage_replicated
 from enact_dist.verify.checker import LockOutcome
 
 if TYPE_CHECKING:
@@ -38,8 +41,10 @@ class ChaosSettings:
         seconds: How long faults happen.
         seed: What faults and clients are drawn from.
         namespaces_required: Whether to fail where there are no network namespaces.
-        daemon_module: Runs a shard; tests put a broken one in its place.
-        deck: How many faults of each kind come in turn.
+        daemon_module: Runs a shard; tests put a broken one in its place.  "": as usual.
+        deck: How many faults of each kind come in turn; None: as usual.
+        store: Address of a database that keeps the shards, `NODES`: two servers of the run's own,
+            "": folders do.
     """
 
     seconds: float
@@ -47,8 +52,9 @@ class ChaosSettings:
     shards: int = 3
     actors: int = 8
     namespaces_required: bool = False
-    daemon_module: str = daemon.MODULE
-    deck: Mapping[str, int] = field(default_factory=lambda: DECK)
+    daemon_module: str = ""
+    deck: Mapping[str, int] | None = None
+    store: str = ""
 
 
 def run(settings: ChaosSettings, folder: Path, *, progress: Callable[[str, float], None]) -> None:
@@ -60,53 +66,80 @@ def run(settings: ChaosSettings, folder: Path, *, progress: Callable[[str, float
         progress: Gets what is being done, and how many seconds of faults are left.
 
     Raises:
-        ConfigError: The folder is not empty.
-        LinkError: Namespaces are required and cannot be made.
+        ConfigError: The folder is not empty, or the settings exclude each other.
+        LinkError: Namespaces are required and cannot be made, or the database cannot be used.
     """
     if any(folder.iterdir()):
         raise ConfigError(f"{folder} is not empty; name a new folder")
     shards = tuple(f"s{index}" for index in range(settings.shards))
     groups = tuple(f"g{index}" for index in range(-(-settings.actors // CLIENTS_PER_HOST)))
-    hosts = open_hosts(
-        (*shards, *groups, WATCHER_HOST),
-        seed=settings.seed,
-        required=settings.namespaces_required,
-    )
     log = Journal(folder / FAULTS)
-    told = {
-        "seed": settings.seed,
-        "seconds": settings.seconds,
-        "shards": settings.shards,
-        "actors": settings.actors,
-        "ttl_s": TTL_S,
-        "missing": hosts.missing,
-        "groups": {f"a{i}": groups[i // CLIENTS_PER_HOST] for i in range(settings.actors)},
-    }
-    (folder / SETTINGS).write_text(json.dumps(told, indent=1) + "\n")
-    cell = TestedCell(
-        folder,
-        hosts,
-        shards,
-        log,
-        ttl_s=TTL_S,
-        seed=settings.seed,
-        daemon_module=settings.daemon_module,
-    )
-    try:
-        progress("starting", settings.seconds)
-        cell.start(shards, told["groups"], watcher_host=WATCHER_HOST)  # type: ignore[arg-type]
-        injector = FaultInjector(
-            cell, hosts, groups, log, seed=settings.seed, ttl_s=TTL_S, deck=settings.deck
+    with ExitStack() as undo:
+        undo.callback(log.close)
+        staged = _stage(settings, folder, log, shards, groups, undo)
+        told = {
+            "seed": settings.seed,
+            "seconds": settings.seconds,
+            "shards": settings.shards,
+            "actors": settings.actors,
+            "ttl_s": TTL_S,
+            "missing": staged.hosts.missing,
+            "groups": {f"a{i}": groups[i // CLIENTS_PER_HOST] for i in range(settings.actors)},
+        }
+        if settings.store:
+            told["store"] = without_password(settings.store)
+        (folder / SETTINGS).write_text(json.dumps(told, indent=1) + "\n")
+        try:
+            progress("starting", settings.seconds)
+            cell = staged.cell
+            cell.start(shards, told["groups"], watcher_host=WATCHER_HOST)  # type: ignore[arg-type]
+            staged.injector.run(
+                settings.seconds, progress=lambda left_s: progress("faults", left_s)
+            )
+            progress("coming to rest", 0.0)
+            _rest(cell, log)
+        except LinkError as error:
+            log.write("failure", "a process failed", str(error))
+
+
+def _stage(
+    settings: ChaosSettings,
+    folder: Path,
+    log: Journal,
+    shards: tuple[str, ...],
+    groups: tuple[str, ...],
+    undo: ExitStack,
+) -> Staged:
+    """Make the hosts, the cell, and what harms them."""
+    seed = settings.seed
+    if settings.store:
+        if settings.namespaces_required and settings.store != NODES:
+            raise ConfigError(
+                "--require-namespaces: no network of a run leads to the database of --store;"
+                " leave one of them out, or say --store nodes"
+            )
+        return stage_replicated(
+            settings.store,
+            folder,
+            log,
+            shards,
+            groups,
+            undo,
+            watcher=WATCHER_HOST,
+            seed=seed,
+            ttl_s=TTL_S,
+            deck=settings.deck,
+            daemon_module=settings.daemon_module or replicated_daemon.MODULE,
         )
-        injector.run(settings.seconds, progress=lambda left_s: progress("faults", left_s))
-        progress("coming to rest", 0.0)
-        _rest(cell, log)
-    except LinkError as error:
-        log.write("failure", "a process failed", str(error))
-    finally:
-        cell.close()
-        hosts.close()
-        log.close()
+    required = settings.namespaces_required
+    hosts = open_hosts((*shards, *groups, WATCHER_HOST), seed=seed, required=required)
+    undo.callback(hosts.close)
+    module = settings.daemon_module or daemon.MODULE
+    cell = TestedCell(folder, hosts, shards, log, ttl_s=TTL_S, seed=seed, daemon_module=module)
+    undo.callback(cell.close)
+    deck = settings.deck or DECK
+    injector = FaultInjector(cell, hosts, groups, log, seed=seed, ttl_s=TTL_S, deck=deck)
+    return Staged(hosts, cell, injector)
 
 
 def _rest(cell: TestedCell, log: Journal) -> None:
@@ -127,13 +160,7 @@ def _rest(cell: TestedCell, log: Journal) -> None:
         log.write("failure", "a lock is left", what)
     cell.watcher.tell("end")
     cell.watcher.expect("done", timeout_s=END_S)
-    for shard in cell.shards.values():
-        shard.ready.clear()
-        shard.process.signal(signal.SIGTERM)
-    for name, shard in cell.shards.items():
-        status = shard.process.wait_status(END_S)
-        if status != 0:
-            log.write("failure", "a shard does not end well", f"{name}: {status}")
+    cell.end_shards()
 
 
 def seed_of_now() -> int:

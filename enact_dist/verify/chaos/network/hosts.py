@@ -56,8 +56,8 @@ class Hosts(Protocol):
     def before(self, host: str) -> tuple[str, ...]:
         """Return the command that runs what follows it on a host."""
 
-    def endpoint(self, host: str) -> str:
-        """Return where a shard on this host listens."""
+    def endpoint(self, host: str, index: int = 0) -> str:
+        """Return where a shard on this host listens; several shards differ by `index`."""
 
     def cut(self, source: str, target: str) -> None:
         """Lose whatever goes from one host to the other."""
@@ -83,15 +83,17 @@ class Loopback:
         )
         self.clock_ahead_ns = dict.fromkeys(hosts, 0)
         self._kept = KeptPorts()
-        self._ports = {host: self._kept.free() for host in hosts}
+        self._ports: dict[tuple[str, int], int] = {}
 
     def before(self, host: str) -> tuple[str, ...]:
         """Return the command that runs what follows it on a host."""
         return _DIE_WITH_PARENT
 
-    def endpoint(self, host: str) -> str:
-        """Return where a shard on this host listens."""
-        return f"tcp/127.0.0.1:{self._ports[host]}"
+    def endpoint(self, host: str, index: int = 0) -> str:
+        """Return where a shard on this host listens; several shards differ by `index`."""
+        if (host, index) not in self._ports:
+            self._ports[host, index] = self._kept.free()
+        return f"tcp/127.0.0.1:{self._ports[host, index]}"
 
     def cut(self, source: str, target: str) -> None:
         """Refuse: there is nothing between two hosts here."""
@@ -220,9 +222,25 @@ class Namespaces:
         """Return the command that runs what follows it on a host."""
         return (*self._enter(host), *_DIE_WITH_PARENT)
 
-    def endpoint(self, host: str) -> str:
-        """Return where a shard on this host listens."""
-        return f"tcp/{self._addresses[host]}:{_PORT}"
+    def address(self, host: str) -> str:
+        """Return the address of a host."""
+        return self._addresses[host]
+
+    def root(self, host: str) -> Path:
+        """Return the root folder of a host as it is seen from outside."""
+        return Path(f"/proc/{self._pids[host]}/root")
+
+    def execute(self, host: str, *command: str) -> None:
+        """Run a command on a host to its end.
+
+        Raises:
+            LinkError: It failed; the message has what it said.
+        """
+        self._run(self._enter(host), list(command))
+
+    def endpoint(self, host: str, index: int = 0) -> str:
+        """Return where a shard on this host listens; several shards differ by `index`."""
+        return f"tcp/{self._addresses[host]}:{_PORT + index}"
 
     def cut(self, source: str, target: str) -> None:
         """Lose whatever goes from one host to the other."""

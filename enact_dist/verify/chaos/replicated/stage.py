@@ -1,0 +1,149 @@
+"""Makes what a run in a database needs: hosts, servers, the cell, and what harms them."""
+
+from __future__ import annotations
+
+import os
+import time
+from typing import TYPE_CHECKING, Final
+
+from enact_dist.config.types import without_password
+from enact_dist.errors import LinkError
+from enact_dist.verify.chaos.faults import Staged
+from enact_dist.verify.chaos.network.hosts import Loopback, Namespaces
+from enact_dist.verify.chaos.replicated.cell import ReplicatedCell
+from enact_dist.verify.chaos.replicated.database_faults import DatabaseFaults
+from enact_dist.verify.chaos.replicated.faults import DECK, ReplicatedFaults, SharedCuts
+from enact_dist.verify.chaos.replicated.nodes import USER, DatabaseNode, Pair, programs
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from contextlib import ExitStack
+    from pathlib import Path
+
+    from enact_dist.verify.chaos.journal import Journal
+    from enact_dist.verify.chaos.network.hosts import Hosts
+
+NODES: Final = "nodes"
+"""In place of an address: two servers of the run's own."""
+LEASE_S: Final = 1.0
+_DATABASES: Final = ("d0", "d1")
+_PLACES: Final = ("h0", "h1")
+_FORGET: Final = """
+WITH gone AS (DELETE FROM enact.shard WHERE cell = %s RETURNING id),
+    rows AS (DELETE FROM enact.record USING gone WHERE shard = gone.id)
+DELETE FROM enact.body USING gone WHERE shard = gone.id
+"""
+
+
+def stage_replicated(
+    store: str,
+    folder: Path,
+    log: Journal,
+    shards: tuple[str, ...],
+    groups: tuple[str, ...],
+    undo: ExitStack,
+    *,
+    watcher: str,
+    seed: int,
+    ttl_s: float,
+    deck: Mapping[str, int] | None,
+    daemon_module: str,
+) -> Staged:
+    """Make hosts and a cell whose shards store in a database.
+
+    Args:
+        store: Its address, or `NODES`.
+        folder: Gets what is left of the run.
+        log: Gets faults and takeovers.
+        shards: Their names.
+        groups: Hosts of clients.
+        undo: Gets what removes everything.
+        watcher: Host of the watcher.
+        seed: What happens is drawn from it.
+        ttl_s: Session TTL.
+        deck: How many faults of each kind come in turn; None: as usual.
+        daemon_module: Runs a shard.
+
+    Raises:
+        LinkError: The database cannot be used, or the system allows no namespaces.
+    """
+    database: DatabaseFaults | None = None
+    others = (*_PLACES, *groups, watcher)
+    hosts: Hosts
+    if store == NODES:
+        programs()
+        hosts = namespaces = Namespaces((*_DATABASES, *others), seed=seed)
+        undo.callback(hosts.close)
+        cuts = SharedCuts(hosts)
+        one, other = (DatabaseNode(namespaces, name, folder) for name in _DATABASES)
+        database = DatabaseFaults(Pair(one, other), others, cuts)
+        undo.callback(database.close)
+        database.start()
+        name = "chaos"
+        places = ",".join(namespaces.address(host) for host in _DATABASES)
+        store = f"postgresql://{USER}@{places}/postgres"
+    else:
+        hosts = Loopback(others, why="the database is not on a network of the run's own")
+        undo.callback(hosts.close)
+        hosts.missing += ("faults of the database (it is not the run's own)",)
+        cuts = SharedCuts(hosts)
+        name = f"chaos-{os.getpid()}-{time.time_ns()}"
+        undo.callback(_leave_nothing, store, name, log)
+        _forget(store, name)
+    cell = ReplicatedCell(
+        folder,
+        hosts,
+        shards,
+        log,
+        ttl_s=ttl_s,
+        seed=seed,
+        store=store,
+        cell=name,
+        places=_PLACES,
+        lease_s=LEASE_S,
+        daemon_module=daemon_module,
+    )
+    undo.callback(cell.close)
+    injector = ReplicatedFaults(
+        cell,
+        hosts,
+        groups,
+        log,
+        seed=seed,
+        ttl_s=ttl_s,
+        deck=deck or DECK,
+        places=_PLACES,
+        lease_s=LEASE_S,
+        cuts=cuts,
+        database=database,
+    )
+    return Staged(hosts, cell, injector)
+
+
+def _leave_nothing(store: str, cell: str, log: Journal) -> None:
+    """Remove a cell at its end."""
+    try:
+        _forget(store, cell)
+    except LinkError as error:
+        log.write("failure", "the rows of the cell are left in the database", f"{cell}: {error}")
+
+
+def _forget(store: str, cell: str) -> None:
+    """Remove a cell from a database.
+
+    Raises:
+        LinkError: The database cannot be used.
+    """
+    try:
+        import psycopg
+    except ImportError as error:
+        raise LinkError(f"the driver of PostgreSQL cannot be loaded: {error}") from error
+    try:
+        with psycopg.connect(
+            store, autocommit=True, connect_timeout=5, target_session_attrs="read-write"
+        ) as connection:
+            there = connection.execute("SELECT to_regclass('enact.body')").fetchone()
+            if there is not None and there[0] is not None:
+                connection.execute(_FORGET, (cell,))
+    except psycopg.Error as failure:
+        raise LinkError(f"{without_password(store)}: {failure}") from failure
