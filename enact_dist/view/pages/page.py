@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.view import markup
 from enact_dist.view.drawing.scene import extent_of
+from enact_dist.view.follower import show_name
 from enact_dist.view.pages import texts
 from enact_dist.view.pages.canvas import Canvas
 from enact_dist.view.pages.comparing import MARKED, NOW
@@ -84,6 +85,7 @@ class Page:
         self._events.put((name, value))
 
     def _run(self) -> None:
+        show_name(self._thread.name)
         try:
             if self._guarded(self._build):
                 return
