@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 AGAIN_S: Final = 1.0
 """Pause before a watch that failed is opened again."""
-GATHER_S: Final = 0.02
+GATHER_S: Final = 0.05
 """How long changes are collected after the first one: a thread that wakes for each costs more."""
 NAMED_MAX: Final = 3
 """Most data that cannot be shown whose reasons are."""
@@ -147,23 +147,26 @@ class Feed(Follower):
         due_s = 0.0
         while not self._stopped and self._wishes:
             now_s = time.monotonic()
-            if now_s >= due_s:
-                self._round(now_s)
-                # At most half of the time is spent here, however large the data are.
-                due_s = now_s + max(1.0 / self._rate_hz, 2.0 * (time.monotonic() - now_s))
-            self._take(watch, max(0.0, due_s - time.monotonic()))
+            if now_s < due_s:
+                self._take(watch, due_s)
+                continue
+            self._round(now_s)
+            # At most half of the time is spent here, however large the data are.
+            due_s = now_s + max(1.0 / self._rate_hz, 2.0 * (time.monotonic() - now_s))
 
-    def _take(self, watch: Watch, wait_s: float) -> None:
-        until_s = time.monotonic() + wait_s
-        if self._noted(watch, wait_s):
-            left_s = max(0.0, until_s - time.monotonic())
+    def _take(self, watch: Watch, until_s: float) -> None:
+        """Wait for a change, and collect those that come after it."""
+        if not self._noted(watch, 0.0) and not self._noted(watch, until_s - time.monotonic()):
+            return
+        left_s = until_s - time.monotonic()
+        if left_s > 0.0:
             with self._news:
                 self._news.wait_for(lambda: self._stopped, min(GATHER_S, left_s))
             self._noted(watch, 0.0)
 
     def _noted(self, watch: Watch, wait_s: float) -> bool:
         """Note a change and those that came with it; return whether there was one."""
-        first = change = watch.next(wait_s)
+        first = change = watch.next(max(0.0, wait_s))
         now_s = time.monotonic()
         while change is not None:
             slot = Slot(change.world, change.entity.name, change.aspect)

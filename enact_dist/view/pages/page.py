@@ -171,7 +171,7 @@ class Page:
                 self._samples.add(data[slot])
         shown = {slot: data[slot] for slot in (*drawn, *labelled) if slot in data}
         whole = len(shown) >= len(drawn) or now_s > self._begun_s + FITTED_S
-        scenes = contents.scenes(shown)
+        scenes = contents.scenes(shown, self._canvas.sides_px())
         line = player.timeline
         with self._client.atomic():  # sent at once: each message alone costs as much as all
             self._draw(scenes, fits=self._fits > (0 if whole else 1))
