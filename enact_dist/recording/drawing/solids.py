@@ -132,8 +132,10 @@ def capsules_of(rows: NDArray[Any]) -> tuple[Capsule, ...]:
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3, 3] = ends_m.mean(axis=1)
     long = lengths_m > 0.0
-    z = along[long] / lengths_m[long, None]
-    x = np.cross(np.eye(3)[np.argmin(np.abs(z), axis=1)], z)
-    x /= np.linalg.norm(x, axis=1)[:, None]
-    poses[long, :3, :3] = np.stack((x, np.cross(z, x), z), axis=2)
+    x, y, z = (along[long] / lengths_m[long, None]).T
+    sign = np.copysign(1.0, z)
+    a = -1.0 / (sign + z)  # two more axes without a case of their own (Duff et al. 2017)
+    b = x * y * a
+    axes = ((1.0 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y), (x, y, z))
+    poses[long, :3, :3] = np.array(axes).transpose(2, 1, 0)
     return tuple(map(Capsule, ends_m, rows[:, 6].tolist(), lengths_m.tolist(), poses))
