@@ -23,6 +23,7 @@ from enact_dist.bench.cases.payloads import run_fetch, run_publish, run_wakeup
 from enact_dist.bench.cases.pipeline import run_pipeline
 from enact_dist.bench.cases.security import run_security
 from enact_dist.bench.cases.updates import run_durable, run_multi, run_update, run_waiters
+from enact_dist.bench.cases.view import run_view
 from enact_dist.bench.cases.workcell import run_workcell
 from enact_dist.bench.floors import Floors
 from enact_dist.bench.place import EMBEDDED, Place
@@ -75,6 +76,7 @@ BENCHES: Final[dict[str, Callable[[Run], None]]] = {
     "memory": run_memory,
     "recovery": run_recovery,
     "security": run_security,
+    "view": run_view,
     "workcell": run_workcell,
     "palletizing": run_palletizing,
 }

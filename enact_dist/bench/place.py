@@ -260,6 +260,15 @@ class Place:
                 _end(process)
 
     @contextlib.contextmanager
+    def command(self, *words: str) -> Iterator[LineProcess]:
+        """Run an `enact` command until the end of the block."""
+        process = self._process(COMMAND, words)
+        try:
+            yield process
+        finally:
+            _end(process)
+
+    @contextlib.contextmanager
     def worker(self, role: str, *, carrier: str, **options: Any) -> Iterator[LineProcess]:
         """Run `enact_dist.bench.worker` in a role; it has said ``ready:``."""
         with self.workers([(role, options)], carrier=carrier) as (process,):

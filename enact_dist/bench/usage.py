@@ -6,9 +6,11 @@ slope after the warm-up, by the median of all pairs of samples, which a single h
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import statistics
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -109,6 +111,16 @@ def _used(pids: Sequence[int]) -> Used:
     # The kernel has an exact clock for each process.
     cpu_s = sum(time.clock_gettime((~pid << 3) | 2) for pid in pids)
     return Used(cpu_s, found["private"], found["shared"])
+
+
+def thread_seconds(pid: int) -> Counter[str]:
+    """Return the processor time of the threads of a process by their names, seconds."""
+    found: Counter[str] = Counter()
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # ended meanwhile
+            on_ns = int((task / "schedstat").read_text().split()[0])
+            found[(task / "comm").read_text().strip()] += on_ns / 1e9
+    return found
 
 
 def private_bytes(pid: int) -> int:

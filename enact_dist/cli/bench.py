@@ -113,8 +113,8 @@ VERBS: Final = (
                    choices=CARRIERS, default="auto"),
             seconds_of("--seconds",
                        "measuring time of each line, all rounds together (default: 3, with which"
-                       " all benches take about 10 minutes on a quiet machine); a pipeline runs 20"
-                       " times as long", dest="seconds_s"),
+                       " all benches take about 10 minutes on a quiet machine); a pipeline and"
+                       " a view run 20 times as long", dest="seconds_s"),
             counted("--seeds",
                     "`workcell --embedded` plays each scenario with seeds 1 to N (default: 1; one"
                     " takes about 3 minutes of two processors)", 1),

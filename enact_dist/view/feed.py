@@ -26,9 +26,14 @@ if TYPE_CHECKING:
 AGAIN_S: Final = 1.0
 """Pause before a watch that failed is opened again."""
 GATHER_S: Final = 0.02
-"""How long changes are collected after the first one: a thread that wakes for each costs more."""
+"""How long changes are collected after the first one that comes to a quiet cell."""
+GATHERED_S: Final = 0.2
+"""For so long at most they are collected at once."""
+CAMERAS_TOGETHER: Final = 4
+"""Cameras whose new images are fetched in one round; those of more cameras come in turns."""
 NAMED_MAX: Final = 3
 """Most data that cannot be shown whose reasons are."""
+PICTURES: Final = frozenset(("image", "mask"))
 PROBED_MAX: Final = 16
 """Aspects without `shows` whose first datum is looked at in one round."""
 
@@ -144,26 +149,31 @@ class Feed(Follower):
             return not self._stopped
 
     def _follow(self, watch: Watch) -> None:
-        due_s = 0.0
+        due_s, came = 0.0, False
         while not self._stopped and self._wishes:
             now_s = time.monotonic()
-            if now_s >= due_s:
-                self._round(now_s)
-                # At most half of the time is spent here, however large the data are.
-                due_s = now_s + max(1.0 / self._rate_hz, 2.0 * (time.monotonic() - now_s))
-            self._take(watch, max(0.0, due_s - time.monotonic()))
+            if now_s < due_s:
+                # Where data change all the time, each change that wakes this thread costs more
+                # than to look for all of them when the next round is due.
+                came = self._gathered(watch, due_s) if came else self._noted(watch, due_s - now_s)
+                if came:
+                    self._gathered(watch, min(due_s, time.monotonic() + GATHER_S))
+                continue
+            self._round(now_s)
+            # At most half of the time is spent here, however large the data are.
+            due_s = now_s + max(1.0 / self._rate_hz, 2.0 * (time.monotonic() - now_s))
 
-    def _take(self, watch: Watch, wait_s: float) -> None:
-        until_s = time.monotonic() + wait_s
-        if self._noted(watch, wait_s):
-            left_s = max(0.0, until_s - time.monotonic())
+    def _gathered(self, watch: Watch, until_s: float) -> bool:
+        """Let changes collect for a while and note them; return whether there was one."""
+        left_s = min(until_s - time.monotonic(), GATHERED_S)
+        if left_s > 0.0:
             with self._news:
-                self._news.wait_for(lambda: self._stopped, min(GATHER_S, left_s))
-            self._noted(watch, 0.0)
+                self._news.wait_for(lambda: self._stopped, left_s)
+        return self._noted(watch, 0.0)
 
     def _noted(self, watch: Watch, wait_s: float) -> bool:
         """Note a change and those that came with it; return whether there was one."""
-        first = change = watch.next(wait_s)
+        first = change = watch.next(max(0.0, wait_s))
         now_s = time.monotonic()
         while change is not None:
             slot = Slot(change.world, change.entity.name, change.aspect)
@@ -181,7 +191,7 @@ class Feed(Follower):
             for slot in [slot for slot in self._shown if slot not in wanted]:
                 del self._shown[slot]
         probes = self._probes()
-        changed = [slot for slot in wanted if self._is_new(slot)]
+        changed = self._in_turns([slot for slot in wanted if self._is_new(slot)])
         away = self._source.still_away()
         asked = [s for s in {*changed, *probes} if self._source.shard_of(s) not in away]
         if not asked:  # what is shown is of this moment, too
@@ -202,6 +212,20 @@ class Feed(Follower):
         if shown is None:
             return not state.null
         return shown.recorded.state != state[:2]
+
+    def _in_turns(self, changed: list[Slot]) -> list[Slot]:
+        """Return what has changed, of images and masks those of the cameras longest not shown."""
+        turns: dict[str, int] = {}
+        pictures: list[Slot] = []
+        for slot in changed:
+            shown = self._shown.get(slot)
+            if shown is not None and not PICTURES.isdisjoint(shown.drawables):
+                pictures.append(slot)
+                stamp_ns = shown.recorded.stamp_ns
+                turns[shown.frame] = min(stamp_ns, turns.get(shown.frame, stamp_ns))
+        later = set(sorted(turns, key=lambda frame: turns[frame])[CAMERAS_TOGETHER:])
+        waiting = {slot for slot in pictures if self._shown[slot].frame in later}
+        return [slot for slot in changed if slot not in waiting]
 
     def _probes(self) -> list[Slot]:
         """Return one datum of each aspect whose kinds have to be guessed."""

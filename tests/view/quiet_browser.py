@@ -50,6 +50,7 @@ class Gui:
 
 class Camera:
     position = look_at = (0.0, 0.0, 0.0)
+    fov, image_height = 0.8, 850
 
 
 class Scene:

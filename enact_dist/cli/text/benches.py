@@ -62,6 +62,14 @@ BENCHES: Final = {
         guest=False,
         named=True,
     ),
+    "view": Told(
+        "`enact view` of 8 cameras, a hull and two robots at 10 Hz: updates shown, what one costs,"
+        " the cell with and without it; needs the extra 'view'",
+        alone=False,
+        guest=False,
+        minutes=True,
+        named=True,
+    ),
     "workcell": Told(
         "eight cameras, hull, speed and path of `enact demo workcell`, scored on its truth;"
         " --embedded plays twelve scenarios in simulated time, which no load changes, for its"

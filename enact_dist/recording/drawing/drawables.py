@@ -37,16 +37,42 @@ _BY_SHAPE: Final = {
 }  # fmt: skip
 
 
-class ShownImage(NamedTuple):
+class ShownImage:
     """An image, or a mask as 0 and 255.
 
-    Attributes:
-        pixels: (H, W), (H, W, 3) or (H, W, 4), of the dtype that the encoding says.
+    Args:
+        pixels: (H, W), (H, W, 3) or (H, W, 4), of the dtype that the encoding says; of a packed
+            mask (H, W / 8) uint8, a bit for each pixel.
         encoding: One of `enact_dist.config.shows.ENCODINGS`.
+        packed: Whether it is a packed mask.
+
+    Attributes:
+        encoding: As above.
     """
 
-    pixels: NDArray[Any]
-    encoding: str
+    __slots__ = ("_packed", "_pixels", "encoding")
+
+    def __init__(self, pixels: NDArray[Any], encoding: str, *, packed: bool = False) -> None:
+        self._pixels, self.encoding, self._packed = pixels, encoding, packed
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """That of the pixels."""
+        rows, columns, *channels = self._pixels.shape
+        return (rows, 8 * columns if self._packed else columns, *channels)
+
+    @property
+    def pixels(self) -> NDArray[Any]:
+        """(H, W), (H, W, 3) or (H, W, 4), of the dtype that the encoding says."""
+        return self.every_nth(1)
+
+    def every_nth(self, step: int) -> NDArray[Any]:
+        """Return every n-th pixel of every n-th row; of a packed mask no others are unpacked."""
+        rows = self._pixels if step == 1 else np.ascontiguousarray(self._pixels[::step])
+        if self._packed:  # whole rows come from cold memory faster
+            rows = np.unpackbits(rows, axis=1)
+            np.negative(rows, out=rows)  # 1 becomes 255
+        return rows[:, ::step]
 
 
 class ShownCloud(NamedTuple):
@@ -189,8 +215,9 @@ def _image(part: object, shows: Shows) -> ShownImage | None:
 def _mask(part: object, _: Shows) -> ShownImage | None:
     for array, beside in arrays_of(part):
         if array.ndim == 2 and array.dtype.kind + str(array.dtype.itemsize) in ("b1", "u1"):
-            is_packed = array is beside.get("packed") and array.dtype == np.uint8
-            covers = np.unpackbits(array, axis=1) if is_packed else (array != 0).view(np.uint8)
+            if array is beside.get("packed") and array.dtype == np.uint8:
+                return ShownImage(array, "mono8", packed=True)
+            covers = (array != 0).view(np.uint8)
             return ShownImage(np.negative(covers, out=covers), "mono8")  # 1 becomes 255
     return None
 

@@ -23,6 +23,9 @@ VOXELS_MAX: Final = 1 << 20
 CELLS_MAX: Final = 1 << 26
 """In a grid of more cells, hidden voxels are not looked for."""
 
+DENSE_TIMES: Final = 100
+"""A grid of at most so many cells for each voxel is gone through as a whole, which is faster."""
+
 
 def voxel_faces(voxels: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the outer faces of voxels: what lies between two of them is left out.
@@ -65,14 +68,25 @@ def outer_voxels(voxels: NDArray[Any]) -> NDArray[np.int64]:
     if not len(voxels):
         return np.empty((0, 3), np.int64)
     codes, lowest, extent = _coded(voxels)
-    if np.prod(extent, dtype=np.float64) > CELLS_MAX:
+    cells = int(np.prod(extent, dtype=np.float64))
+    if cells > CELLS_MAX:
         return np.stack(np.unravel_index(codes, extent), axis=1) + lowest
-    occupied = np.zeros(np.prod(extent), bool)
+    occupied = np.zeros(cells, bool)
     occupied[codes] = True
-    hidden = np.ones(len(codes), bool)
-    for step in (extent[1] * extent[2], extent[2], 1):
-        hidden &= occupied[codes - step] & occupied[codes + step]
-    return np.stack(np.unravel_index(codes[~hidden], extent), axis=1) + lowest
+    steps = (int(extent[1] * extent[2]), int(extent[2]), 1)
+    if cells > DENSE_TIMES * len(codes):
+        hidden = np.ones(len(codes), bool)
+        for step in steps:
+            hidden &= occupied[codes - step] & occupied[codes + step]
+        outer = codes[~hidden]
+    else:
+        free = ~occupied
+        shown = np.zeros(cells, bool)
+        for step in steps:
+            shown[step:] |= free[:-step]
+            shown[:-step] |= free[step:]
+        outer = np.flatnonzero(shown & occupied)
+    return np.stack(np.unravel_index(outer, extent), axis=1) + lowest
 
 
 def _coded(voxels: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
@@ -85,11 +99,13 @@ def _coded(voxels: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64], 
     apart = max(float(high) - float(low) for low, high in zip(*corners, strict=True)) + 3.0
     if apart > VOXELS_MAX:
         raise ValueError(f"voxels lie {apart:.0f} apart; a grid has at most {VOXELS_MAX}")
-    indices = columns.astype(np.int64)
-    lowest = indices.min(axis=1) - 1
-    extent = indices.max(axis=1) - lowest + 2
-    strides = np.array([extent[1] * extent[2], extent[2], 1])
-    return strides @ (indices - lowest[:, None]), lowest, extent
+    lowest = corners[0].astype(np.int64) - 1
+    extent = corners[1].astype(np.int64) - lowest + 2
+    codes = np.zeros(len(voxels), np.int64)
+    for column, low, size in zip(columns, lowest, extent, strict=True):
+        codes *= size
+        codes += column.astype(np.int64) - low
+    return codes, lowest, extent
 
 
 class Capsule(NamedTuple):
@@ -116,8 +132,10 @@ def capsules_of(rows: NDArray[Any]) -> tuple[Capsule, ...]:
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3, 3] = ends_m.mean(axis=1)
     long = lengths_m > 0.0
-    z = along[long] / lengths_m[long, None]
-    x = np.cross(np.eye(3)[np.argmin(np.abs(z), axis=1)], z)
-    x /= np.linalg.norm(x, axis=1)[:, None]
-    poses[long, :3, :3] = np.stack((x, np.cross(z, x), z), axis=2)
+    x, y, z = (along[long] / lengths_m[long, None]).T
+    sign = np.copysign(1.0, z)
+    a = -1.0 / (sign + z)  # two more axes without a case of their own (Duff et al. 2017)
+    b = x * y * a
+    axes = ((1.0 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y), (x, y, z))
+    poses[long, :3, :3] = np.array(axes).transpose(2, 1, 0)
     return tuple(map(Capsule, ends_m, rows[:, 6].tolist(), lengths_m.tolist(), poses))

@@ -29,8 +29,7 @@ def png_of(shown: ShownDatum) -> bytes:
     for drawable in shown.drawables.values():
         if isinstance(drawable, ShownImage):
             as_it_is = drawable.encoding in {"mono8", "rgb8", "rgba8", "16UC1"}
-            size_px = max(drawable.pixels.shape)
-            pixels = drawable.pixels if as_it_is else rgb_of(drawable, size_px)
+            pixels = drawable.pixels if as_it_is else rgb_of(drawable, max(drawable.shape))
             stream = BytesIO()
             imageio.imwrite(stream, pixels, extension=".png")
             return stream.getvalue()

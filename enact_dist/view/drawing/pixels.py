@@ -11,8 +11,10 @@ if TYPE_CHECKING:
 
     from enact_dist.recording.drawing.drawables import ShownImage
 
+SIDES_PX: Final = (160, 320, 640)
+"""Longest sides of images in the scene: the first that is no smaller than what a page shows."""
 SIDE_PX_MAX: Final = 320
-"""Longest side of an image in the scene."""
+"""Longest side of an image of which it is not known how large a page shows it."""
 HALF_MASK_COLOUR: Final = np.array((127, 25, 15), np.uint8)
 """What is added to half of the colour of a covered pixel."""
 
@@ -24,7 +26,7 @@ def rgb_of(shown: ShownImage, side_px_max: int = SIDE_PX_MAX) -> NDArray[np.uint
         shown: The image; numbers that are no bytes go from black (smallest) to white (largest).
         side_px_max: Longest side; every n-th pixel of a larger image is taken.
     """
-    pixels = _every_nth(shown.pixels, side_px_max)
+    pixels = _at_most(shown, side_px_max)
     if pixels.ndim == 3:
         red, blue = (2, 0) if shown.encoding.startswith("bgr") else (0, 2)
         found = np.empty((*pixels.shape[:2], 3), np.uint8)
@@ -36,10 +38,8 @@ def rgb_of(shown: ShownImage, side_px_max: int = SIDE_PX_MAX) -> NDArray[np.uint
     return np.repeat(pixels[:, :, None], 3, axis=2)
 
 
-def _every_nth(pixels: NDArray[Any], side_px_max: int) -> NDArray[Any]:
-    step = max(1, -(-max(pixels.shape[:2]) // side_px_max))
-    rows = np.ascontiguousarray(pixels[::step])  # whole rows come from cold memory faster
-    return rows[:, ::step]
+def _at_most(shown: ShownImage, side_px_max: int) -> NDArray[Any]:
+    return shown.every_nth(max(1, -(-max(shown.shape[:2]) // side_px_max)))
 
 
 def _as_bytes(pixels: NDArray[Any]) -> NDArray[np.uint8]:
@@ -56,7 +56,7 @@ def _as_bytes(pixels: NDArray[Any]) -> NDArray[np.uint8]:
 
 def with_mask(image: NDArray[np.uint8], mask: ShownImage) -> NDArray[np.uint8]:
     """Return an image with what a mask covers in red; a mask of another shape is left out."""
-    covers = _every_nth(mask.pixels, max(image.shape[:2])) > 0
+    covers = _at_most(mask, max(image.shape[:2])) > 0
     if covers.shape != image.shape[:2]:
         return image
     found = image.copy()

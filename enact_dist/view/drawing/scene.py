@@ -37,7 +37,7 @@ from enact_dist.view.drawing.nodes import (
     RobotNode,
     SurfaceNode,
 )
-from enact_dist.view.drawing.pixels import rgb_of, with_mask
+from enact_dist.view.drawing.pixels import SIDE_PX_MAX, rgb_of, with_mask
 from enact_dist.view.drawing.robots import Robot, robot_of
 from enact_dist.wire.payload import decode_untyped
 
@@ -134,6 +134,7 @@ def scene_of(
     *,
     tints: Mapping[Slot, Colour] | None = None,
     frames_of: Mapping[Slot, ShownDatum] | None = None,
+    sides_px: Mapping[str, int] | None = None,
 ) -> SceneView:
     """Return the scene of the data of one moment.
 
@@ -141,8 +142,9 @@ def scene_of(
         data: The data that are to be drawn.
         tints: Colours of data in place of their own.
         frames_of: Data whose transforms hold where `data` have none.
+        sides_px: Longest side of the image in each frame; `SIDE_PX_MAX` in all others.
     """
-    tints = tints or {}
+    tints, sides_px = tints or {}, sides_px or {}
     nodes: dict[str, Node] = {}
     remarks: list[str] = []
     transforms = dict(_transforms([*(frames_of or {}).values(), *data.values()]))
@@ -162,7 +164,8 @@ def scene_of(
             if drawable is None:
                 remarks.append(f"{slot} v{shown.recorded.version} does not fit the kind {kind}")
     for camera in _cameras(data, tints).values():
-        nodes[f"{camera.parts[0].recorded.slot}#camera"] = _frustum(camera)
+        side_px = sides_px.get(camera.frame, SIDE_PX_MAX)
+        nodes[f"{camera.parts[0].recorded.slot}#camera"] = _frustum(camera, side_px)
         remarks += camera.remarks
     asked = dict.fromkeys([*(node.frame for node in nodes.values()), *transforms])
     frames = placed(transforms, asked)
@@ -337,14 +340,14 @@ def _cameras(data: Mapping[Slot, ShownDatum], tints: Mapping[Slot, Colour]) -> d
     return cameras
 
 
-def _frustum(camera: _Camera) -> FrustumNode:
+def _frustum(camera: _Camera, side_px: int) -> FrustumNode:
     first, *others = camera.parts
-    key = ("frustum", camera.tint, *map(id, others))
+    key = ("frustum", camera.tint, side_px, *map(id, others))
     known = first.made.get(key)
     if known is None:
         _forget_older(first.made, "frustum")
         # The parts stay referenced with the node, so that their ids stay theirs.
-        known = first.made[key] = _new_frustum(camera), others
+        known = first.made[key] = _new_frustum(camera, side_px), others
     node: FrustumNode = known[0]
     return node
 
@@ -356,13 +359,13 @@ def _forget_older(made: dict[object, Any], what: str) -> None:
         made.pop(each, None)
 
 
-def _new_frustum(camera: _Camera) -> FrustumNode:
+def _new_frustum(camera: _Camera, side_px: int) -> FrustumNode:
     image = None
     pictures = [(camera.image, "image")] + [(mask, "mask") for mask in camera.masks]
     for shown, kind in pictures:
         drawable = shown.drawables[kind] if shown is not None else None
-        if isinstance(drawable, ShownImage) and drawable.pixels.size:
-            image = rgb_of(drawable) if image is None else with_mask(image, drawable)
+        if isinstance(drawable, ShownImage) and all(drawable.shape):
+            image = rgb_of(drawable, side_px) if image is None else with_mask(image, drawable)
     pinhole = camera.calibration and camera.calibration.drawables["calibration"]
     if isinstance(pinhole, ShownCamera) and pinhole.matrix[1, 1] > 0 and pinhole.height_px > 0:
         field_rad = 2.0 * math.atan(pinhole.height_px / (2.0 * pinhole.matrix[1, 1]))

@@ -22,6 +22,7 @@ from enact_dist.view.drawing.nodes import (
     RobotNode,
     SurfaceNode,
 )
+from enact_dist.view.drawing.pixels import SIDES_PX
 from enact_dist.view.drawing.shapes import (
     CUBE,
     CYLINDER,
@@ -42,6 +43,8 @@ if TYPE_CHECKING:
     from enact_dist.view.drawing.shapes import Instances, ShapeMesh
 
 JPEG_QUALITY: Final = 75
+FRUSTUM_M: Final = 0.06
+"""Of a frustum, in sizes of the scene."""
 _FROM: Final = np.array((0.75, -0.75, 0.6))
 """From where a page looks, in sizes of the scene."""
 
@@ -96,6 +99,23 @@ class Canvas:
             self._frames.pop(frame)[1].remove()
             self._numbers.pop(f"frame {frame}", None)
 
+    def sides_px(self) -> dict[str, int]:
+        """Return how many pixels the longest side of each camera's image needs, by frame.
+
+        A frustum that stands small in the page needs few; a person who looks closer gets more.
+        """
+        camera = self._client.camera
+        scale_px = camera.image_height / (2.0 * math.tan(camera.fov / 2.0))  # at 1 m
+        eye_m = np.asarray(camera.position)
+        found: dict[str, int] = {}
+        for node, _, _ in self._drawn.values():
+            if isinstance(node, FrustumNode) and node.frame in self._frames:
+                pose, _ = self._frames[node.frame]
+                away_m = float(np.linalg.norm(pose[:3, 3] - eye_m)) + 1e-3
+                shown_px = FRUSTUM_M * self.size_m * _side_of(node) / away_m * scale_px
+                found[node.frame] = next((px for px in SIDES_PX if px >= shown_px), SIDES_PX[-1])
+        return found
+
     def fit(self, low_m: NDArray[np.float64], high_m: NDArray[np.float64]) -> None:
         """Look at everything between two corners (3,); choose the sizes of axes, frusta, points."""
         self.size_m = max(0.05, float(max(high_m - low_m)))
@@ -118,7 +138,7 @@ class Canvas:
 
     def _place(self, frame: str, pose: NDArray[np.float64]) -> None:
         known = self._frames.get(frame)
-        if known is not None and np.array_equal(known[0], pose):
+        if known is not None and (known[0] is pose or known[0].tobytes() == pose.tobytes()):
             return
         turned, place = _pose(pose)
         if known is None:
@@ -189,7 +209,7 @@ class Canvas:
             path,
             node.field_rad,
             node.aspect,
-            scale=0.06 * self.size_m,
+            scale=FRUSTUM_M * self.size_m,
             thickness=0.003 * self.size_m,
             color=node.colour,
             image=node.image,
@@ -287,6 +307,13 @@ class Canvas:
     @_add.register
     def _(self, node: LabelNode, path: str) -> Any:
         return self._scene.add_label(path, node.text, position=tuple(node.place_m))
+
+
+def _side_of(node: FrustumNode) -> float:
+    """Return the longer side of a frustum's image in its scale: viser keeps the volume as it is."""
+    y = math.tan(node.field_rad / 2.0)
+    x = y * node.aspect
+    return 2.0 * max(x, y) / (x * y / 3.0) ** (1.0 / 3.0)
 
 
 def _is_same(before: Node, node: Node) -> bool:

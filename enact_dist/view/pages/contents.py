@@ -12,7 +12,7 @@ from enact_dist.view.pages.comparing import ShownDifference, Side
 from enact_dist.view.timeline import Player, Timeline
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from enact_dist.compare.diff import Diff
     from enact_dist.config.shows import Shows
@@ -185,8 +185,14 @@ class PageContents:
                 unfit = f"{slot} v{recorded.version} cannot be shown: {error}"
         return shown, found.forgotten, unfit
 
-    def scenes(self, data: dict[Slot, ShownDatum]) -> dict[str, SceneView]:
+    def scenes(
+        self, data: dict[Slot, ShownDatum], sides_px: Mapping[str, int] | None = None
+    ) -> dict[str, SceneView]:
         """Return the scene of the moment and, of a difference, what the other side has.
+
+        Args:
+            data: The data of the moment.
+            sides_px: Longest side of the image in each frame.
 
         Raises:
             LockTimeoutError: A commit before the moment is still undecided.
@@ -196,7 +202,7 @@ class PageContents:
             left, live=self.player.live, now_ns=self._now_ns(), marked_ns=self.marked_ns
         )
         tints = {slot: tint for slot in data if (tint := self.comparing.tint(slot))}
-        scene = scene_of(data, tints=tints)
+        scene = scene_of(data, tints=tints, sides_px=sides_px)
         nodes = dict(scene.nodes)
         if self.trails:
             nodes |= self._trails.follow(scene.nodes, self.at_ns)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.view import markup
 from enact_dist.view.drawing.scene import extent_of
+from enact_dist.view.follower import show_name
 from enact_dist.view.pages import texts
 from enact_dist.view.pages.canvas import Canvas
 from enact_dist.view.pages.comparing import MARKED, NOW
@@ -84,6 +85,7 @@ class Page:
         self._events.put((name, value))
 
     def _run(self) -> None:
+        show_name(self._thread.name)
         try:
             if self._guarded(self._build):
                 return
@@ -169,7 +171,7 @@ class Page:
                 self._samples.add(data[slot])
         shown = {slot: data[slot] for slot in (*drawn, *labelled) if slot in data}
         whole = len(shown) >= len(drawn) or now_s > self._begun_s + FITTED_S
-        scenes = contents.scenes(shown)
+        scenes = contents.scenes(shown, self._canvas.sides_px())
         line = player.timeline
         with self._client.atomic():  # sent at once: each message alone costs as much as all
             self._draw(scenes, fits=self._fits > (0 if whole else 1))

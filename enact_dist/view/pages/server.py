@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.access.watch import Closing
 from enact_dist.errors import ConfigError
+from enact_dist.view.follower import show_name
 from enact_dist.view.pages.page import Page
 
 if TYPE_CHECKING:
@@ -84,6 +85,11 @@ def _bind(host: str, port: int) -> None:
         raise absent
 
 
+async def _in_loop(_: ClientHandle) -> None:
+    """Name the thread in which viser's loop runs."""
+    show_name("view server")
+
+
 class ViewServer(Closing):
     """The server of the pages; also a context manager.
 
@@ -135,6 +141,7 @@ class ViewServer(Closing):
         self._viewer = viewer
         self._pages: dict[int, Page] = {}
         self._guard = threading.Lock()
+        self._server.on_client_connect(_in_loop)
         self._server.on_client_connect(self._open)
         self._server.on_client_disconnect(self._close)
         self.port = self._server.get_port()
