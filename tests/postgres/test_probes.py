@@ -1,5 +1,7 @@
 """Probes of both daemons of a shard: who is ready, who is alive, and what a standby's page shows."""
 
+import time
+
 import pytest
 from postgres_nodes import await_sync
 from probed_cell import ProbedCell, value
