@@ -13,7 +13,7 @@ from enact_dist.verify.chaos.journal import Journal
 from enact_dist.verify.chaos.network.hosts import Loopback
 from enact_dist.verify.chaos.replicated.answers import AnswerTimes, read_answers
 from enact_dist.verify.chaos.replicated.cell import AS_ORDERED, UNEXPECTED_END, ReplicatedCell
-from enact_dist.verify.chaos.replicated.faults import SharedCuts, ways_between
+from enact_dist.verify.chaos.replicated.cuts import SharedCuts, ways_between
 from enact_dist.verify.chaos.replicated.stage import _forget
 
 S = 10**9

@@ -24,6 +24,7 @@ import os
 import random
 import signal
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Final
 
@@ -117,7 +118,15 @@ class FaultInjector:
         Raises:
             LinkError: A process ended by itself, or a shard does not come up.
         """
-        end_s = time.monotonic() + seconds
+        try:
+            self._run(time.monotonic() + seconds, progress)
+            while self._ends:  # an end may bring another one
+                self._end_due(float("inf"))
+        except LinkError:
+            self._give_up()
+            raise
+
+    def _run(self, end_s: float, progress: Callable[[float], None]) -> None:
         due_s = time.monotonic() + self._draw.uniform(*PAUSE_S)
         while (now_s := time.monotonic()) < end_s:
             next_s = min(due_s, end_s, self._ends[0][0] if self._ends else end_s)
@@ -128,8 +137,13 @@ class FaultInjector:
             if time.monotonic() >= due_s:
                 self._begin()
                 due_s = time.monotonic() + self._draw.uniform(*PAUSE_S)
-        while self._ends:  # an end may bring another one
-            self._end_due(float("inf"))
+
+    def _give_up(self) -> None:
+        """End what is under way once one of the ends has failed, as far as the others do not."""
+        give_up_s = time.monotonic() + END_S
+        while self._ends and time.monotonic() < give_up_s:
+            with suppress(LinkError):
+                self._end_due(float("inf"))
 
     def _end_due(self, now_s: float) -> None:
         while self._ends and self._ends[0][0] <= now_s:
@@ -348,7 +362,7 @@ class FaultInjector:
 
 
 @dataclass(frozen=True, slots=True)
-class Staged:
+class StagedRun:
     """What a run starts, and what harms it."""
 
     hosts: Hosts

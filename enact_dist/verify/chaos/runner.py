@@ -14,7 +14,7 @@ from enact_dist.errors import ConfigError, LinkError
 from enact_dist.verify.chaos import daemon
 from enact_dist.verify.chaos.cell import END_S, TestedCell
 from enact_dist.verify.chaos.evidence import FAULTS, SETTINGS
-from enact_dist.verify.chaos.faults import DECK, FaultInjector, Staged
+from enact_dist.verify.chaos.faults import DECK, FaultInjector, StagedRun
 from enact_dist.verify.chaos.journal import Journal
 from enact_dist.verify.chaos.network.hosts import open_hosts
 from enact_dist.verify.chaos.replicated import daemon as replicated_daemon
@@ -89,13 +89,16 @@ def run(settings: ChaosSettings, folder: Path, *, progress: Callable[[str, float
         if settings.store:
             told["store"] = without_password(settings.store)
         (folder / SETTINGS).write_text(json.dumps(told, indent=1) + "\n")
+        progress("starting", settings.seconds)
+        cell = staged.cell
         try:
-            progress("starting", settings.seconds)
-            cell = staged.cell
             cell.start(shards, told["groups"], watcher_host=WATCHER_HOST)  # type: ignore[arg-type]
-            staged.injector.run(
-                settings.seconds, progress=lambda left_s: progress("faults", left_s)
-            )
+            try:
+                staged.injector.run(
+                    settings.seconds, progress=lambda left_s: progress("faults", left_s)
+                )
+            except LinkError as error:  # the last look is for the other anomalies
+                log.write("failure", "a process failed", str(error))
             progress("coming to rest", 0.0)
             _rest(cell, log)
         except LinkError as error:
@@ -109,7 +112,7 @@ def _stage(
     shards: tuple[str, ...],
     groups: tuple[str, ...],
     undo: ExitStack,
-) -> Staged:
+) -> StagedRun:
     """Make the hosts, the cell, and what harms them."""
     seed = settings.seed
     if settings.store:
@@ -139,7 +142,7 @@ def _stage(
     undo.callback(cell.close)
     deck = settings.deck or DECK
     injector = FaultInjector(cell, hosts, groups, log, seed=seed, ttl_s=TTL_S, deck=deck)
-    return Staged(hosts, cell, injector)
+    return StagedRun(hosts, cell, injector)
 
 
 def _rest(cell: TestedCell, log: Journal) -> None:

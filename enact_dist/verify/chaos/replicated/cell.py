@@ -41,7 +41,7 @@ UNEXPECTED_END: Final = "a daemon ended for no reason that it may have"
 
 
 @dataclass(slots=True, eq=False)
-class Place:
+class DaemonPlace:
     """Where a daemon of a shard runs.
 
     Attributes:
@@ -97,7 +97,7 @@ class ReplicatedCell(TestedCell):
         daemon_module: str = daemon.MODULE,
     ) -> None:
         self._places, self._store, self._lease_s, self._name = places, store, lease_s, cell
-        self.places: dict[str, Place] = {}
+        self.places: dict[str, DaemonPlace] = {}
         self._keeping = threading.Lock()
         self._closing = threading.Event()
         super().__init__(
@@ -123,7 +123,7 @@ class ReplicatedCell(TestedCell):
         )
         for shard, endpoints in listen.items():
             for host, endpoint in zip(self._places, endpoints, strict=True):
-                place = Place(shard, host, endpoint)
+                place = DaemonPlace(shard, host, endpoint)
                 self.places[place.name] = place
 
     # ---------------------------------------------------------------- daemons
@@ -135,7 +135,7 @@ class ReplicatedCell(TestedCell):
                 # A child dies with the thread that started it, so this one stays.
                 threading.Thread(target=self._keep, args=(place,), daemon=True).start()
 
-    def _keep(self, place: Place) -> None:
+    def _keep(self, place: DaemonPlace) -> None:
         """Run one daemon after the other."""
         while not self._closing.is_set():
             with self._keeping:
@@ -151,7 +151,7 @@ class ReplicatedCell(TestedCell):
             self._closing.wait(place.pause_s)
             place.pause_s, place.ordered = AGAIN_S, False
 
-    def _start(self, place: Place) -> LineProcess:
+    def _start(self, place: DaemonPlace) -> LineProcess:
         place.starts += 1
         place.logged = log.stat().st_size if (log := self._output(place)).exists() else 0
         answers = self._folder / f"{place.name}.{place.starts}{SUFFIX}"
@@ -160,7 +160,7 @@ class ReplicatedCell(TestedCell):
         words = (ahead_ns, str(answers), *what, "--listen", place.listen)
         return self._run(self._module, words, place.name, place.host)
 
-    def _listen(self, place: Place, process: LineProcess) -> None:
+    def _listen(self, place: DaemonPlace, process: LineProcess) -> None:
         """Take note of what a daemon says until it ends."""
         epoch = fenced_ns = ready_ns = 0
         while True:
@@ -183,13 +183,13 @@ class ReplicatedCell(TestedCell):
         if epoch and not ready_ns:
             self._note_takeover(place, epoch, fenced_ns, time.monotonic_ns())
 
-    def _output(self, place: Place) -> Path:
+    def _output(self, place: DaemonPlace) -> Path:
         return self._folder / f"{place.name}.output"
 
-    def _note_takeover(self, place: Place, epoch: int, fenced_ns: int, ready_ns: int) -> None:
+    def _note_takeover(self, place: DaemonPlace, epoch: int, fenced_ns: int, ready_ns: int) -> None:
         self._log.write("restart", place.shard, epoch, fenced_ns, fenced_ns, ready_ns, ready_ns)
 
-    def _note_end(self, place: Place, process: LineProcess) -> None:
+    def _note_end(self, place: DaemonPlace, process: LineProcess) -> None:
         status = process.status
         log = self._output(place).read_bytes()[place.logged :].decode(errors="replace")
         stops = [line for line in log.splitlines() if _CRITICAL in line]
@@ -214,15 +214,19 @@ class ReplicatedCell(TestedCell):
 
     def end_shards(self) -> None:
         """End all daemons in good order."""
+        for place in self.places.values():
+            place.up.wait(END_S)
         with self._keeping:
             self._closing.set()
-        processes = {p.name: p.process for p in self.places.values() if p.process is not None}
-        for process in processes.values():
-            process.signal(signal.SIGTERM)
-        for name, process in processes.items():
-            status = process.wait_status(END_S)
-            if status != 0:
-                self._log.write("failure", "a shard does not end well", f"{name}: {status}")
+        running = [(p, p.process, p.up.is_set()) for p in self.places.values()]
+        for _, process, _ in running:
+            if process is not None:
+                process.signal(signal.SIGTERM)
+        for place, process, was_up in running:
+            status = process.wait_status(END_S) if process is not None else 0
+            # One that is just being started does not heed the signal yet.
+            if status != 0 and (was_up or status != -signal.SIGTERM):
+                self._log.write("failure", "a shard does not end well", f"{place.name}: {status}")
 
     def close(self) -> None:
         """End every process, however it is; twice is harmless."""

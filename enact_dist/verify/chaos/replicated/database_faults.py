@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from concurrent.futures import Future
     from random import Random
 
-    from enact_dist.verify.chaos.replicated.faults import SharedCuts
-    from enact_dist.verify.chaos.replicated.nodes import Pair
+    from enact_dist.verify.chaos.replicated.cuts import SharedCuts
+    from enact_dist.verify.chaos.replicated.nodes import DatabasePair
 
 TARGET: Final = "database"
 KILL, STOP, LOSE_STANDBY = "kill database", "stop database", "lose database standby"
@@ -54,7 +54,7 @@ class DatabaseFaults:
         names: Its hosts.
     """
 
-    def __init__(self, pair: Pair, others: tuple[str, ...], cuts: SharedCuts) -> None:
+    def __init__(self, pair: DatabasePair, others: tuple[str, ...], cuts: SharedCuts) -> None:
         self._pair, self._others, self._cuts = pair, others, cuts
         self.names = (pair.primary.name, pair.standby.name)
         # A server dies with the thread that started it.
@@ -125,10 +125,9 @@ class DatabaseFaults:
             time.sleep(draw.choice((0.0, 0.5, 2.0)))
             pair.swap()
             time.sleep(draw.choice((0.5, 2.0, 5.0)))
-            old.kill()
         finally:
+            old.kill()
             self._cuts.heal(ways)
-        old.copy(new)
 
     def _end_wait(self, draw: Random, how: str) -> str:
         pair = self._pair

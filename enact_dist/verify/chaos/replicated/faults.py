@@ -22,9 +22,7 @@ from __future__ import annotations
 
 import random
 import signal
-import threading
 import time
-from collections import Counter
 from typing import TYPE_CHECKING, ClassVar, Final, cast
 
 from enact_dist.verify.chaos.cell import END_S
@@ -38,14 +36,16 @@ from enact_dist.verify.chaos.faults import (
 )
 from enact_dist.verify.chaos.replicated import database_faults
 from enact_dist.verify.chaos.replicated.cell import AGAIN_S, ReplicatedCell
+from enact_dist.verify.chaos.replicated.cuts import ways_between
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Callable, Mapping
     from concurrent.futures import Future
 
     from enact_dist.verify.chaos.journal import Journal
     from enact_dist.verify.chaos.network.hosts import Hosts
-    from enact_dist.verify.chaos.replicated.cell import Place
+    from enact_dist.verify.chaos.replicated.cell import DaemonPlace
+    from enact_dist.verify.chaos.replicated.cuts import SharedCuts
     from enact_dist.verify.chaos.replicated.database_faults import DatabaseFaults
 
 KILL_SERVING, KILL_STANDBY = "kill serving daemon", "kill standby daemon"
@@ -74,45 +74,6 @@ DECK: Final = {
 }
 AWAKE_S: Final = 15.0
 """How long an old daemon sleeps if no other takes over."""
-
-
-class SharedCuts:
-    """Cuts that several faults may make at once: each way opens again after the last of them.
-
-    Thread-safe.
-    """
-
-    def __init__(self, hosts: Hosts) -> None:
-        self._hosts = hosts
-        self._counts: Counter[tuple[str, str]] = Counter()
-        self._lock = threading.Lock()
-
-    def cut(self, ways: Iterable[tuple[str, str]]) -> None:
-        """Close these ways."""
-        with self._lock:
-            for way in ways:
-                if not self._counts[way]:
-                    self._hosts.cut(*way)
-                self._counts[way] += 1
-
-    def heal(self, ways: Iterable[tuple[str, str]]) -> None:
-        """End one cut of each of these ways."""
-        with self._lock:
-            for way in ways:
-                self._counts[way] -= 1
-                if not self._counts[way]:
-                    self._hosts.heal(*way)
-
-
-def ways_between(
-    one: str, others: Iterable[str], *, sends: bool = True, hears: bool = True
-) -> list[tuple[str, str]]:
-    """Return the ways between a host and others: those by which it sends, by which it hears."""
-    others = tuple(others)
-    return [
-        *((one, other) for other in others if sends),
-        *((other, one) for other in others if hears),
-    ]
 
 
 class ReplicatedFaults(FaultInjector):
@@ -170,7 +131,7 @@ class ReplicatedFaults(FaultInjector):
 
     # ---------------------------------------------------------------- daemons
 
-    def _daemon(self, *, serves: bool) -> Place | None:
+    def _daemon(self, *, serves: bool) -> DaemonPlace | None:
         """Draw a daemon to which nothing is being done."""
         places = cast("ReplicatedCell", self._cell).places
         name = self._free([n for n, p in places.items() if p.up.is_set() and p.serves == serves])
@@ -188,7 +149,7 @@ class ReplicatedFaults(FaultInjector):
         self._await_up(place, kind, from_ns)
         return True
 
-    def _await_up(self, place: Place, kind: str, from_ns: int) -> None:
+    def _await_up(self, place: DaemonPlace, kind: str, from_ns: int) -> None:
         """Note a fault once a daemon is up again."""
         self._busy.add(place.name)
 

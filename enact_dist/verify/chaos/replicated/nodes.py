@@ -1,8 +1,8 @@
 """Two servers of PostgreSQL on hosts of their own: one takes writes, the other confirms them.
 
 Each has a small disk for its data and one for its log, which are memory and go with the host.  What
-a manager such as Patroni does on real hosts is done here by `Pair`: it promotes, goes on with one
-copy, makes the second one again.
+a manager such as Patroni does on real hosts, `DatabasePair` does here: it promotes a server, goes
+on with one copy, and makes the second one again.
 """
 
 from __future__ import annotations
@@ -231,7 +231,7 @@ class DatabaseNode:
         return rows
 
 
-class Pair:
+class DatabasePair:
     """A primary and its synchronous standby.
 
     Attributes:
@@ -241,12 +241,11 @@ class Pair:
 
     def __init__(self, primary: DatabaseNode, standby: DatabaseNode) -> None:
         self.primary, self.standby = primary, standby
+        self._copies_anew = True
 
     def start(self) -> None:
         """Make both; return once each commit is confirmed by the standby."""
         self.primary.init()
-        self.primary.start()
-        self.standby.copy(self.primary)
         self.make_whole()
 
     def one_copy(self) -> None:
@@ -254,9 +253,10 @@ class Pair:
         self.primary.ask(_STANDBYS.format(""), _RELOAD)
 
     def swap(self) -> None:
-        """Promote the standby, which goes on alone."""
-        self.standby.ask("SELECT pg_promote(true, 30)")
+        """Promote the standby, which goes on alone; the old primary has to be copied anew."""
+        self.standby.ask("SELECT pg_promote(true, 4)")
         self.primary, self.standby = self.standby, self.primary
+        self._copies_anew = True
         self.one_copy()
 
     def make_whole(self) -> None:
@@ -268,12 +268,15 @@ class Pair:
         self.primary.start()
         end_s = time.monotonic() + WAIT_S
         while time.monotonic() < end_s and not self.standby.ended:
-            with suppress(LinkError):
+            with suppress(LinkError):  # a cut between the two, for example
+                if self._copies_anew:
+                    self.standby.copy(self.primary)
+                self._copies_anew = False
                 self.standby.start(AWAY_S)
                 if self._is_whole():
                     return
             self.standby.kill()
-            self.standby.copy(self.primary)
+            self._copies_anew = True
         raise LinkError("the database's standby confirms no commits")
 
     def _is_whole(self) -> bool:

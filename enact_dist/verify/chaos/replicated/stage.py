@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import os
 import time
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from enact_dist.config.types import without_password
 from enact_dist.errors import LinkError
-from enact_dist.verify.chaos.faults import Staged
+from enact_dist.verify.chaos.faults import StagedRun
 from enact_dist.verify.chaos.network.hosts import Loopback, Namespaces
 from enact_dist.verify.chaos.replicated.cell import ReplicatedCell
+from enact_dist.verify.chaos.replicated.cuts import SharedCuts
 from enact_dist.verify.chaos.replicated.database_faults import DatabaseFaults
-from enact_dist.verify.chaos.replicated.faults import DECK, ReplicatedFaults, SharedCuts
-from enact_dist.verify.chaos.replicated.nodes import USER, DatabaseNode, Pair, programs
+from enact_dist.verify.chaos.replicated.faults import DECK, ReplicatedFaults
+from enact_dist.verify.chaos.replicated.nodes import USER, DatabaseNode, DatabasePair, programs
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -48,7 +49,7 @@ def stage_replicated(
     ttl_s: float,
     deck: Mapping[str, int] | None,
     daemon_module: str,
-) -> Staged:
+) -> StagedRun:
     """Make hosts and a cell whose shards store in a database.
 
     Args:
@@ -67,38 +68,17 @@ def stage_replicated(
     Raises:
         LinkError: The database cannot be used, or the system allows no namespaces.
     """
-    database: DatabaseFaults | None = None
-    others = (*_PLACES, *groups, watcher)
-    hosts: Hosts
-    if store == NODES:
-        programs()
-        hosts = namespaces = Namespaces((*_DATABASES, *others), seed=seed)
-        undo.callback(hosts.close)
-        cuts = SharedCuts(hosts)
-        one, other = (DatabaseNode(namespaces, name, folder) for name in _DATABASES)
-        database = DatabaseFaults(Pair(one, other), others, cuts)
-        undo.callback(database.close)
-        database.start()
-        name = "chaos"
-        places = ",".join(namespaces.address(host) for host in _DATABASES)
-        store = f"postgresql://{USER}@{places}/postgres"
-    else:
-        hosts = Loopback(others, why="the database is not on a network of the run's own")
-        undo.callback(hosts.close)
-        hosts.missing += ("faults of the database (it is not the run's own)",)
-        cuts = SharedCuts(hosts)
-        name = f"chaos-{os.getpid()}-{time.time_ns()}"
-        undo.callback(_leave_nothing, store, name, log)
-        _forget(store, name)
+    opened = _open_nodes if store == NODES else _open_loopback
+    found = opened(store, folder, log, (*_PLACES, *groups, watcher), undo, seed)
     cell = ReplicatedCell(
         folder,
-        hosts,
+        found.hosts,
         shards,
         log,
         ttl_s=ttl_s,
         seed=seed,
-        store=store,
-        cell=name,
+        store=found.store,
+        cell=found.cell,
         places=_PLACES,
         lease_s=LEASE_S,
         daemon_module=daemon_module,
@@ -106,7 +86,7 @@ def stage_replicated(
     undo.callback(cell.close)
     injector = ReplicatedFaults(
         cell,
-        hosts,
+        found.hosts,
         groups,
         log,
         seed=seed,
@@ -114,10 +94,49 @@ def stage_replicated(
         deck=deck or DECK,
         places=_PLACES,
         lease_s=LEASE_S,
-        cuts=cuts,
-        database=database,
+        cuts=found.cuts,
+        database=found.database,
     )
-    return Staged(hosts, cell, injector)
+    return StagedRun(found.hosts, cell, injector)
+
+
+class _Opened(NamedTuple):
+    """Where a run takes place; `cell`: its name in the database at `store`."""
+
+    hosts: Hosts
+    cuts: SharedCuts
+    database: DatabaseFaults | None
+    cell: str
+    store: str
+
+
+def _open_nodes(
+    _: str, folder: Path, _log: Journal, others: tuple[str, ...], undo: ExitStack, seed: int
+) -> _Opened:
+    """Make hosts, and two servers on their own ones."""
+    programs()
+    hosts = Namespaces((*_DATABASES, *others), seed=seed)
+    undo.callback(hosts.close)
+    cuts = SharedCuts(hosts)
+    one, other = (DatabaseNode(hosts, name, folder) for name in _DATABASES)
+    database = DatabaseFaults(DatabasePair(one, other), others, cuts)
+    undo.callback(database.close)
+    database.start()
+    places = ",".join(hosts.address(host) for host in _DATABASES)
+    return _Opened(hosts, cuts, database, "chaos", f"postgresql://{USER}@{places}/postgres")
+
+
+def _open_loopback(
+    store: str, _: Path, log: Journal, others: tuple[str, ...], undo: ExitStack, _seed: int
+) -> _Opened:
+    """Use a database that is there."""
+    hosts = Loopback(others, why="the database is not on a network of the run's own")
+    undo.callback(hosts.close)
+    hosts.missing += ("faults of the database (it is not the run's own)",)
+    cell = f"chaos-{os.getpid()}-{time.time_ns()}"
+    undo.callback(_leave_nothing, store, cell, log)
+    _forget(store, cell)
+    return _Opened(hosts, SharedCuts(hosts), None, cell, store)
 
 
 def _leave_nothing(store: str, cell: str, log: Journal) -> None:
