@@ -12,7 +12,6 @@ from test_store_ledger import BATCHES, at_work
 
 from enact_dist.core.protocol.records import Persist
 from enact_dist.errors import StoreError
-from enact_dist.link.postgres import bodies
 
 
 @pytest.fixture(scope="module")
@@ -91,37 +90,6 @@ def test_large_bodies_come_back_in_one_piece(url, stores):
     data = {record.slot.entity: record.datum for record in recovered.slots}
     assert bytes(data["large"].body) == body
     assert bytes(data["small"].body) == (1).to_bytes(8, "little")
-
-
-@pytest.mark.parametrize(
-    ("damage", "found"),
-    [
-        ("UPDATE enact.record SET body = body || 'x'::bytea WHERE kind = 5", "checksum"),
-        ("UPDATE enact.record SET id = id + 1000, key = key || 'x'::bytea WHERE kind = 5", "row"),
-        ("UPDATE enact.body SET data = substr(data, 2)", "bytes instead of"),
-        ("UPDATE enact.body SET data = set_byte(data, 3, 99)", "its checksum is wrong"),
-        ("DELETE FROM enact.body WHERE true", "it is missing"),
-        ("DELETE FROM enact.record WHERE batch > 2", "its newest row is of batch"),
-    ],
-)
-def test_damaged_tables_are_refused(url, stores, damage, found):
-    """With the name of the database and what to do, and the shard is free for another try."""
-    address = address_of(url)
-    store, _, medium = stores.open(address)
-    store.write([state(1, "large", body=bytes(bodies.PART_BYTES + 5))])
-    store.write([state(1)])
-    session, shard = medium.line._session, medium._tenure.shard
-    table_and = damage + (" AND" if "WHERE" in damage else " WHERE") + f" shard = {shard}"
-    session.connection.execute(table_and)
-    store.close()
-
-    with pytest.raises(StoreError, match=found) as refused:
-        stores.open(address)
-
-    assert address.shard in str(refused.value)
-    assert "pg_restore" in str(refused.value)
-    with pytest.raises(StoreError, match=found):
-        stores.open(address)
 
 
 def test_a_database_that_is_not_there_is_named(stores, server):

@@ -123,6 +123,37 @@ def test_a_daemon_without_its_database_falls_silent_and_goes_on(cell, pair, clie
     assert standby.status is None
 
 
+def test_a_takeover_waits_for_the_databases_standby(cell, pair, clients):
+    """Its new epoch counts once that has confirmed it: nothing is answered before."""
+    active = cell.start(0)
+    standby = cell.start(1, says=STANDS_BY)
+    counting = clients()
+    pair[1].pause()
+    try:
+        active.kill()
+        await_line(cell, 1, "is being taken over")
+        before, held_s = [len(client.done_s) for client in counting], time.monotonic()
+        time.sleep(2.5)  # longer than the lease of the new epoch
+        after = [len(client.done_s) for client in counting]
+    finally:
+        pair[1].go_on()
+    standby.expect(READY)
+    for client in counting:
+        client.await_after(held_s)
+    assert before == after, "an update was acknowledged that stood on one host"
+    for client in counting:
+        client.end()
+    assert standby.status is None
+    await_sync(pair[0])
+
+
+def await_line(cell, place, text):
+    deadline_s = time.monotonic() + 30
+    while text not in cell.log(place).read_text():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.1)  # a file tells of no new lines
+
+
 def test_a_daemon_that_is_cut_off_from_its_database_is_replaced(cell, pair, clients):
     """It falls silent before the standby serves, and ends when it reaches the database again."""
     first, _ = pair
@@ -169,10 +200,7 @@ def test_a_takeover_that_the_database_does_not_confirm_ends_when_it_is_told_to(c
     pair[1].pause()
     try:
         active.kill()
-        deadline_s = time.monotonic() + 30
-        while "is being taken over" not in cell.log(1).read_text():
-            assert time.monotonic() < deadline_s
-            time.sleep(0.1)  # a file tells of no new lines
+        await_line(cell, 1, "is being taken over")
         standby.signal(signal.SIGTERM)
         assert standby.wait_status(10) == 0
     finally:

@@ -40,6 +40,16 @@ SELECT array_agg(name) FROM unnest(ARRAY['enact.shard', 'enact.record', 'enact.b
 WHERE to_regclass(name) IS NULL
 """
 """Names the tables that are not there."""
+WITHOUT_ROW: Final = """
+WITH RECURSIVE found(shard) AS (
+    SELECT min(shard) FROM enact.record
+    UNION ALL
+    SELECT (SELECT min(shard) FROM enact.record WHERE shard > found.shard) FROM found
+    WHERE shard IS NOT NULL
+)
+SELECT count(*) FROM found WHERE shard IS NOT NULL AND shard NOT IN (SELECT id FROM enact.shard)
+"""
+"""Counts shards that have data and no row of their own; looks once per shard into the index."""
 STATE: Final = "SELECT id, format, epoch, batch, beat, holder FROM enact.shard"
 _ONE: Final = " WHERE cell = %b AND name = %b"
 FENCE: Final = """
@@ -148,7 +158,7 @@ def make_tables(session: DatabaseSession, cell: str, shard: str) -> None:
     """Make the tables and the shard's row, unless they are there.
 
     Raises:
-        StoreError: The tables are of another format.
+        StoreError: The tables are of another format, or rows of shards are missing.
         psycopg.Error: As the database reports it; this user may not make them.
     """
     connection = session.connection
@@ -160,6 +170,13 @@ def make_tables(session: DatabaseSession, cell: str, shard: str) -> None:
             connection.execute("SELECT pg_advisory_xact_lock(4711)")
             if missing != (None,):
                 connection.execute(_MAKE, prepare=False)
+            if (lacking := (session.row(WITHOUT_ROW) or (0,))[0]) > 0:
+                raise StoreError(
+                    f"shard {shard} of cell {cell} has no row in table enact.shard, and nor have"
+                    f" {lacking} shards with data in enact.record: one of them may be this one;"
+                    " restore the database from a backup (pg_restore), or delete the rows of"
+                    " enact.record whose shard has none in enact.shard, and the shard begins empty"
+                )
             connection.execute(
                 "INSERT INTO enact.shard (cell, name, format, epoch, batch, beat, holder)"
                 " VALUES (%s, %s, %s, 0, 0, 0, '') ON CONFLICT DO NOTHING",
