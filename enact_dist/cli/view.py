@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 PORT: Final = 8080
 ANSWER_S: Final = 2.0
 """How long a shard is waited for: a page goes on without one that has gone."""
-
 TOKEN_VARIABLE: Final = "ENACT_VIEW_TOKEN"  # noqa: S105 - its name
 
 
@@ -69,14 +68,15 @@ VERBS: Final = (
 
 def run_view(options: argparse.Namespace) -> int:
     """Serve pages until a signal."""
-    from enact_dist.view.pages.server import ViewServer, require_viser
+    from enact_dist.view.pages.server import ViewServer, load_viser
     from enact_dist.view.pages.viewer import Viewer
-    from enact_dist.view.recorded import RecordingSource
 
-    require_viser()
+    load_viser()
     with ExitStack() as stack:
         stop = stack.enter_context(StopSignals())
         if Path(options.cell or "").suffix == ".mcap":
+            from enact_dist.view.recorded import RecordingSource
+
             shown: Cell | RecordingSource = RecordingSource(options.cell)
             options.cell = None
         else:

@@ -37,16 +37,20 @@ module          what it does
 packages that all this needs are those of the extra ``record``.
 """
 
+from importlib import import_module
+from typing import TYPE_CHECKING
+
 from enact_dist.config.shows import Shows
 from enact_dist.recording.libraries import require_libraries
 
-require_libraries()
+if TYPE_CHECKING:
+    from enact_dist.recording.exporting import ExportSummary, export_world
+    from enact_dist.recording.reading import Recording
+    from enact_dist.recording.recorder import Recorder
+    from enact_dist.recording.replaying import Replay, ReplaySummary
+    from enact_dist.recording.summary import RecordingSummary
 
-from enact_dist.recording.exporting import ExportSummary, export_world  # noqa: E402
-from enact_dist.recording.reading import Recording  # noqa: E402
-from enact_dist.recording.recorder import Recorder  # noqa: E402
-from enact_dist.recording.replaying import Replay, ReplaySummary  # noqa: E402
-from enact_dist.recording.summary import RecordingSummary  # noqa: E402
+require_libraries()
 
 __all__ = [
     "ExportSummary",
@@ -58,3 +62,22 @@ __all__ = [
     "Shows",
     "export_world",
 ]
+
+_HOME_OF = {
+    "ExportSummary": "exporting",
+    "Recorder": "recorder",
+    "Recording": "reading",
+    "RecordingSummary": "summary",
+    "Replay": "replaying",
+    "ReplaySummary": "replaying",
+    "export_world": "exporting",
+}
+
+
+def __getattr__(name: str) -> object:
+    """Load one of the names above at its first use: to draw a datum needs none of them."""
+    if name not in _HOME_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value: object = getattr(import_module(f"{__name__}.{_HOME_OF[name]}"), name)
+    globals()[name] = value
+    return value

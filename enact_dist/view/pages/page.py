@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.view import markup
 from enact_dist.view.drawing.scene import extent_of
-from enact_dist.view.follower import show_name
+from enact_dist.view.follower import stand_back
 from enact_dist.view.pages import texts
 from enact_dist.view.pages.canvas import Canvas
 from enact_dist.view.pages.comparing import MARKED, NOW
@@ -85,7 +85,7 @@ class Page:
         self._events.put((name, value))
 
     def _run(self) -> None:
-        show_name(self._thread.name)
+        stand_back(self._thread.name)
         try:
             if self._guarded(self._build):
                 return
@@ -95,7 +95,8 @@ class Page:
                 took_s = time.monotonic() - begun_s
                 # At most half of the time is spent here, however much there is to draw.
                 rested_s = begun_s + 2.0 * took_s
-                period_s = FILLING_S if self._fills else 1.0 / self._viewer.rate_hz
+                hurries = self._fills or self._begins
+                period_s = FILLING_S if hurries else 1.0 / self._viewer.rate_hz
                 self._take_events(rested_s, max(begun_s + period_s, rested_s))
         finally:
             self._viewer.feed.wish(self, None)
@@ -157,7 +158,7 @@ class Page:
         contents, player = self.contents, self.contents.player
         player.advance(min(1.0, now_s - self._ticked_s))
         self._ticked_s = now_s
-        listing_due = now_s - self._listed_s >= LISTED_S
+        listing_due = now_s - self._listed_s >= (FILLING_S if self._begins else LISTED_S)
         if listing_due:
             self._listed_s = now_s
             self._list()
@@ -183,6 +184,11 @@ class Page:
                 self._show_panels(data)
         if listing_due and player.live and not self._fills:
             contents.learn_history(self._of_history())
+
+    @property
+    def _begins(self) -> bool:
+        """Whether the page is new and still empty."""
+        return not self._draws and time.monotonic() < self._begun_s + FITTED_S
 
     @property
     def _fills(self) -> bool:

@@ -9,12 +9,13 @@ import secrets
 import socket
 import threading
 import warnings
+from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.access.watch import Closing
 from enact_dist.errors import ConfigError
-from enact_dist.view.follower import show_name
+from enact_dist.view.follower import stand_back
 from enact_dist.view.pages.page import Page
 
 if TYPE_CHECKING:
@@ -39,6 +40,16 @@ def require_viser() -> None:
             "the view needs viser, which this Python does not have: install the extra 'view'"
             " (pip install -e '.[view]' in the clone of enact-dist)"
         )
+
+
+def load_viser() -> None:
+    """Begin to load viser beside whatever comes next, such as the connection to a cell.
+
+    Raises:
+        ConfigError: viser is not installed.
+    """
+    require_viser()
+    threading.Thread(target=import_module, args=("enact_dist.view.pages.door",)).start()
 
 
 def free_port(host: str, port: int) -> int:
@@ -85,9 +96,9 @@ def _bind(host: str, port: int) -> None:
         raise absent
 
 
-async def _in_loop(_: ClientHandle) -> None:
-    """Name the thread in which viser's loop runs."""
-    show_name("view server")
+async def _stand_back(_: ClientHandle) -> None:
+    """Let the thread in which viser's loop runs stand back, too."""
+    stand_back("view server")
 
 
 class ViewServer(Closing):
@@ -141,7 +152,7 @@ class ViewServer(Closing):
         self._viewer = viewer
         self._pages: dict[int, Page] = {}
         self._guard = threading.Lock()
-        self._server.on_client_connect(_in_loop)
+        self._server.on_client_connect(_stand_back)
         self._server.on_client_connect(self._open)
         self._server.on_client_disconnect(self._close)
         self.port = self._server.get_port()

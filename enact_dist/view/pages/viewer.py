@@ -11,9 +11,9 @@ from enact_dist.core.protocol.datum import Position
 from enact_dist.errors import MisuseError, UnknownWorldError
 from enact_dist.view.activity import Activity, CellActivity
 from enact_dist.view.feed import Feed
-from enact_dist.view.recorded import RecordingFeed, RecordingSource
 from enact_dist.view.source import CellSource
 from enact_dist.view.timeline import Timeline
+from enact_dist.world.cell import Cell
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.messages import VersionEntry
     from enact_dist.terms import Aspect
     from enact_dist.view.pages.comparing import Side
-    from enact_dist.world.cell import Cell
+    from enact_dist.view.recorded import RecordingFeed, RecordingSource
     from enact_dist.world.lineage import Made
 
 BYTES_S: Final = 150e6
@@ -78,7 +78,9 @@ class Viewer(Closing):
         self.feed: Feed | RecordingFeed
         self.source: CellSource | RecordingSource
         self.cell: CellSource | None = None
-        if isinstance(shown, RecordingSource):
+        if not isinstance(shown, Cell):
+            from enact_dist.view.recorded import RecordingFeed
+
             known = shown.catalogue.worlds()
             if self.world and self.world not in known:
                 raise UnknownWorldError(
