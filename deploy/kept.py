@@ -93,7 +93,9 @@ def run(*words: str, cwd: Path | None = None) -> None:
 
 def base() -> Path:
     """Return a folder with base.tar, a Debian with Python, and the packages that images unpack."""
-    packages = {name for file in PACKAGES for name in (REQUIREMENTS / file).read_text("utf-8").split()}
+    packages = {
+        name for file in PACKAGES for name in (REQUIREMENTS / file).read_text("utf-8").split()
+    }
     fetch = f"cd /packages && apt-get download -qq {' '.join(sorted(packages))}"
     words = [
         "mmdebstrap",

@@ -268,7 +268,8 @@ def _shard(shard: ShardInfo) -> Iterator[Finding]:
         yield warn(
             f"disk of {shard.name}",
             f"stood still for more than a second {stalls} times since the shard started",
-            "see the shard's log for when; move its folder to another disk, or what else uses this",
+            "see the shard's log for when; look at what else uses the disk of its folder, or at its"
+            " database",
         )
     alarms = shard.counters.get("alarms", 0)
     if alarms:
@@ -328,8 +329,11 @@ def clock_skew(subject: str, ahead_s: float) -> Finding:
 
 
 def _unreachable(subject: str, endpoint: str) -> Finding:
-    found, remedy = knock(endpoint)
-    return fail(subject, f"{endpoint} does not answer: {found}", remedy)
+    """Say why a shard does not answer at any of its endpoints, which are comma separated."""
+    knocked = {one: knock(one) for one in endpoint.split(", ")}
+    found = [f"at {one}, {why}" if len(knocked) > 1 else why for one, (why, _) in knocked.items()]
+    remedies = dict.fromkeys(remedy for _, remedy in knocked.values())
+    return fail(subject, f"{endpoint} does not answer: {'; '.join(found)}", "; ".join(remedies))
 
 
 def knock(endpoint: str, *, timeout_s: float = 2.0) -> tuple[str, str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from enact_dist.config.types import without_password
 from enact_dist.errors import StoreError
@@ -13,6 +13,9 @@ if TYPE_CHECKING:
 
     from enact_dist.config.types import CellConfig
     from enact_dist.link.postgres.examine import DatabaseReport
+
+_BEING_MADE: Final = "pg_basebackup"
+"""As what a standby is connected that is not there yet."""
 
 
 def database_of(config: CellConfig) -> DatabaseReport:
@@ -38,15 +41,31 @@ def holders(config: CellConfig) -> Callable[[str], str]:
         return lambda _: problem
     if found.problem:
         return lambda _: f"its database cannot be used: {found.problem}; {found.remedy}"
+    return lambda shard: _holder(found, shard)
 
-    def why(shard: str) -> str:
-        row = found.shards.get(shard)
-        if row is None or not (row.holder or row.standbys):
-            return "no process holds it in its database, and none stands by"
-        stands_by = row.stands_by and f", {row.stands_by}"
-        return f"{row.served}, as its database says{stands_by}"
 
-    return why
+def overview(config: CellConfig) -> Iterator[str]:
+    """Yield who serves and who stands by, a line for each shard, and how many copies there are."""
+    try:
+        found = database_of(config)
+    except StoreError as error:
+        yield f"store: {error}"
+        return
+    if found.problem:
+        shown = without_password(config.store)
+        yield f"store: {shown} cannot be used: {found.problem}; {found.remedy}"
+        return
+    for shard in config.shards:
+        yield f"shard {shard.name}: {_holder(found, shard.name)}"
+    copies = _copies(found)
+    yield f"{copies.subject}: {copies.text}"
+
+
+def _holder(found: DatabaseReport, shard: str) -> str:
+    row = found.shards.get(shard)
+    if row is None or not (row.holder or row.standbys):
+        return "no process holds it in its database, and none stands by"
+    return f"{row.served}, as its database says; {row.stands_by or 'no standby is seen'}"
 
 
 def database(config: CellConfig) -> Iterator[Finding]:
@@ -93,8 +112,10 @@ def database(config: CellConfig) -> Iterator[Finding]:
 def _copies(found: DatabaseReport) -> Finding:
     subject = "copies of the store"
     others = f"; standbys that confirm nothing: {', '.join(found.others)}" if found.others else ""
+    if len(found.copies) == 1:
+        return ok(subject, f"two, as {found.copies[0]} confirms each commit{others}")
     if found.copies:
-        return ok(subject, f"{', '.join(found.copies)} confirms each commit{others}")
+        return ok(subject, f"at least two, as {', '.join(found.copies)} confirm commits{others}")
     if found.named:
         return fail(
             subject,
@@ -103,8 +124,11 @@ def _copies(found: DatabaseReport) -> Finding:
             "start the standby, or let the database's manager take it out of the setting; if this"
             " user cannot see standbys: GRANT pg_monitor",
         )
+    alone = "one: a commit stands on the database's one host, and is lost with it"
+    if any(one.startswith(_BEING_MADE) for one in found.others):
+        return warn(subject, f"{alone}; a second one is being made", "wait until it is made")
     return warn(
         subject,
-        f"one: a commit stands on the database's one host, and is lost with it{others}",
-        "add a synchronous standby (synchronous_standby_names)",
+        f"{alone}{others}",
+        "start the host that is away, or add a synchronous standby (synchronous_standby_names)",
     )

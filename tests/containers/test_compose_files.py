@@ -8,6 +8,7 @@ pytestmark = pytest.mark.containers
 
 ONE = ("--file", "deploy/compose.yaml")
 SECURE = (*ONE, "--file", "deploy/compose.secure.yaml")
+SURVIVE = (*ONE, "--file", "deploy/compose.survive.yaml")
 TWO = ("--env-file", "deploy/multihost.env", *ONE, "--file", "deploy/compose.multihost.yaml")
 
 
@@ -17,6 +18,7 @@ TWO = ("--env-file", "deploy/multihost.env", *ONE, "--file", "deploy/compose.mul
         (ONE, 12),
         ((*ONE, "--profile", "tools"), 14),
         (SECURE, 13),
+        (SURVIVE, 19),
         ((*ONE, "--profile", "workcell"), 32),
         ((*ONE, "--profile", "packing"), 31),
         ((*TWO, "--profile", "shards"), 5),
@@ -67,3 +69,28 @@ def test_with_keys_each_container_mounts_one_key(engine):
         assert mounts["cell"]["read_only"], name
         assert not mounts.keys() & {"office", "shared"}, name
         assert service["depends_on"]["keys"]["condition"] == "service_completed_successfully"
+
+
+def test_with_two_hosts_only_shards_reach_the_database(engine):
+    """And the operator's commands; two daemons of a shard share no memory."""
+    options = (*SURVIVE, "--profile", "tools", "config", "--format", "json")
+    services = json.loads(engine.compose(*options).stdout)["services"]
+
+    shards = {name for name in services if name.startswith("shard-")}
+    inside = {
+        name for name, service in services.items() if "database" in (service.get("networks") or {})
+    }
+    knowing = {
+        name
+        for name, service in services.items()
+        if "store" in {mount["source"] for mount in service["volumes"]}
+    }
+    assert inside == shards | {"enact", "db-a", "db-b", "etcd", "database"}
+    assert knowing == shards | {"enact", "passwords"}
+    for name in shards:
+        service = services[name]
+        mounted = {mount["source"] for mount in service["volumes"]}
+        assert service["hostname"] == name
+        assert service["command"][:2] == ["shard", "run"]
+        assert f"shard-{service['command'][2]}" == name.removesuffix("-b")
+        assert mounted == {"cell", "store", "shared-b" if name.endswith("-b") else "shared"}

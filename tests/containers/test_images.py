@@ -9,6 +9,7 @@ from engine import ROOT
 pytestmark = pytest.mark.containers
 
 MEGABYTES_MAX = {"core": 300, "keys": 300, "perception": 870, "workcell": 820}
+DATABASE_MEGABYTES_MAX = 290
 BARE = ("run", "--rm", "--network", "none", "--read-only", "--cap-drop", "ALL", "--tmpfs", "/tmp")
 """A container without network, rights, or a place to write but /tmp."""
 
@@ -44,6 +45,24 @@ def test_enact_runs_without_rights_on_a_read_only_root(engine, images, target):
     said = engine.docker(*BARE, f"enact-{target}", "--version").stdout
 
     assert said.startswith("enact-dist ")
+
+
+def test_the_database_is_small_and_misses_no_library(engine, images, inspect):
+    """Its packages were unpacked by a list, without what they depend on."""
+    found = inspect("database")
+    asked = (
+        "ldd /usr/lib/postgresql/15/bin/* /usr/bin/etcd | grep 'not found';"
+        "postgres --version; etcd --version; patroni --version;"
+        "patronictl --help; python -c 'import patroni.dcs.etcd3, psycopg'"
+    )
+    done = engine.docker(*BARE, "--entrypoint", "sh", "enact-database", "-c", asked, check=False)
+
+    assert found["Size"] / 1e6 <= DATABASE_MEGABYTES_MAX
+    assert found["Config"]["User"] == "10001:10001"
+    assert done.returncode == 0, done.stderr
+    assert "not found" not in done.stdout
+    for said in ("postgres (PostgreSQL) 15.", "etcd Version: 3.", "patroni 4.", "switchover"):
+        assert said in done.stdout, done.stdout
 
 
 def python(engine, target, text, *options):

@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "deploy" / "requirements"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
 IN_THE_IMAGE = {"sys_platform": "linux", "platform_machine": "x86_64", "python_version": "3.11"}
-LOCKS = ("build.txt", "core.txt", "record.txt", "perception.txt", "workcell.txt")
+LOCKS = ("build.txt", "core.txt", "record.txt", "perception.txt", "workcell.txt", "database.txt")
 REMEDY = "run ./deploy/images --lock"
 
 
@@ -26,7 +26,9 @@ def asked(lock):
     """Return what pyproject.toml asks for in the place that a lock file serves."""
     project = PROJECT["project"]
     extras = project["optional-dependencies"]
+    patroni = (ROOT / "deploy" / "survive" / "patroni.txt").read_text("utf-8")
     texts = {
+        "database.txt": re.findall(r"^\w.*", patroni, re.MULTILINE),
         "build.txt": PROJECT["build-system"]["requires"],
         "core.txt": project["dependencies"],
         "record.txt": project["dependencies"] + extras["record"] + extras["postgres"],

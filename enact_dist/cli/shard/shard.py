@@ -161,18 +161,17 @@ def list_shards(options: argparse.Namespace) -> Output:
 
 
 def _print_holders(options: argparse.Namespace) -> None:
-    """Print who serves and who stands by, in a cell whose data are in a database."""
+    """Print who serves, who stands by and how many copies there are, if a database has the data."""
     from enact_dist.config.read import load_config
 
     target = cell_target(options)
     config = None if is_endpoint(target) else load_config(target)
     if config is None or not config.store:
         return
-    from enact_dist.operate.doctor_store import holders
+    from enact_dist.operate.doctor_store import overview
 
-    held = holders(config)
-    for shard in config.shards:
-        print(f"enact: shard {shard.name}: {held(shard.name)}", file=sys.stderr)
+    for line in overview(config):
+        print(f"enact: {line}", file=sys.stderr)
 
 
 def _print_counters(shards: Sequence[ShardInfo]) -> None:
