@@ -1,10 +1,14 @@
 """A shard whose lease has ended lets nothing out, and everything in order once it is renewed."""
 
+import time
+
 import pytest
 
+from enact_dist.core.failover.lease import HolderRow, Standby
 from enact_dist.core.protocol.messages import Committed, Granted, ListLocks, Locks, Refused
 from enact_dist.core.protocol.records import Recovered
 from enact_dist.core.shard.shard import Shard
+from enact_dist.link import clock
 from enact_dist.link import lease as lease_module
 from enact_dist.link.clock import SystemClock
 from enact_dist.link.daemon.embedded import EmbeddedCarrier
@@ -85,6 +89,25 @@ def test_a_lease_counts_from_when_a_write_was_sent():
     lease.confirmed(11.9)
     lease.confirmed(10.5)
     assert lease.lease.until_ns / 1e9 == pytest.approx(11.9 + 1.96)
+
+
+def test_a_lease_counts_on_while_its_host_is_suspended(monkeypatch):
+    """A host that wakes up after a minute is silent, though its monotonic clock has hardly moved."""
+    boottime_s, monotonic_ns = 1000.0, 5 * 10**9
+    monkeypatch.setattr(lease_module, "boottime_ns", lambda: int(boottime_s * 1e9))
+    lease, standby = HostLease(2.0), Standby(2 * 10**9)
+    row = HolderRow(epoch=7, batch=1, beat=1, holder="host 1")
+    lease.confirmed(lease.now_s())
+    assert not standby.is_free(row, monotonic_ns)
+    assert lease.holds
+
+    boottime_s += 60.0
+    monotonic_ns += 10**6
+
+    assert not lease.holds
+    assert lease.left_s == pytest.approx(1.96 - 60.0)
+    assert not standby.is_free(row, monotonic_ns)  # it has seen nothing of that minute
+    assert clock.boottime_ns.args == (time.CLOCK_BOOTTIME,)
 
 
 def test_nothing_leaves_a_shard_whose_lease_has_ended(host, holding, make_peer):

@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import psycopg
 
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 BEAT_S: Final = 2.5 * RENEW_S
 """Within that a holder that lives has renewed its lease."""
+LOOK_S: Final = 0.05
+"""How often that is looked at: the database tells of no beat."""
 _SYNCHRONOUS: Final = frozenset({"sync", "quorum"})
 
 
@@ -118,6 +120,19 @@ def examine_database(url: str, cell: str) -> DatabaseReport:
     return found
 
 
+def _renewed(
+    session: DatabaseSession, cell: str, before: dict[int, tuple[Any, ...]]
+) -> list[tuple[Any, ...]]:
+    """Return the rows of shards once each holder has renewed its lease, or had the time for it."""
+    end_s = time.monotonic() + BEAT_S
+    while True:
+        rows = session.connection.execute(SHARDS, (cell,)).fetchall()
+        still = [row for row in rows if row[-1] and row == before.get(row[0])]
+        if not still or time.monotonic() > end_s:
+            return rows
+        time.sleep(LOOK_S)
+
+
 def standbys_of(url: str, cell: str, shard: str) -> dict[str, StandbyFigures]:
     """Return who stands by for a shard, with what they have counted; empty if it cannot be seen."""
     with (
@@ -150,9 +165,7 @@ def _fill(found: DatabaseReport, session: DatabaseSession, cell: str) -> None:
         return
     standbys = _standbys(session)
     before = {row[0]: row for row in session.connection.execute(SHARDS, (cell,))}
-    if any(row[-1] for row in before.values()):
-        time.sleep(BEAT_S)
-    for row in session.connection.execute(SHARDS, (cell,)):
+    for row in _renewed(session, cell, before):
         row_id, name, epoch, batch, _, text = row
         holder = NamedHolder.read(text).process
         alive = bool(holder) and row != before.get(row_id)
