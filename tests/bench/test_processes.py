@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from enact_dist.bench.cases import history, memory, pipeline, view
+from enact_dist.bench.cases import history, memory, pipeline
 from enact_dist.bench.cases.decisions import Decider, granted_of, hand_over_us
 from enact_dist.bench.cases.pipeline_worker import (
     CAMERAS,
@@ -22,6 +22,7 @@ from enact_dist.bench.command import BENCHES
 from enact_dist.bench.floors import ECHO, FDATASYNC, PUBLISH, QUERY, Floors
 from enact_dist.bench.place import EMBEDDED, Place, environment
 from enact_dist.bench.run import Run
+from enact_dist.bench.view import case as view
 from enact_dist.core.protocol.datum import Slot
 from enact_dist.errors import MisuseError
 

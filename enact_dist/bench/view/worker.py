@@ -1,4 +1,4 @@
-"""A process of the view's bench: `python -m enact_dist.bench.cases.view_worker CELL ROLE {}`.
+"""A process of the view's bench: `python -m enact_dist.bench.view.worker CELL ROLE {}`.
 
 ========  =======================================================================================
 writer    writes at 10 Hz images and masks of eight cameras, a hull and two robots

@@ -19,10 +19,10 @@ from dataclasses import dataclass, field
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Final
 
-from enact_dist.bench.cases.view_worker import CHROMIUM, SHOWS
 from enact_dist.bench.place import fresh_place
 from enact_dist.bench.rows import Case, at_most, sample_of, value_row
 from enact_dist.bench.usage import private_bytes, threads_ns
+from enact_dist.bench.view.worker import CHROMIUM, SHOWS
 from enact_dist.errors import MisuseError
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from enact_dist.verify.daemons import LineProcess
 
 NAME: Final = "view"
-WORKER: Final = "enact_dist.bench.cases.view_worker"
+WORKER: Final = "enact_dist.bench.view.worker"
 TIMES: Final = 20
 """The rounds together run this many times as long as a line of another bench: 60 s by default."""
 ROUNDS: Final = 3
