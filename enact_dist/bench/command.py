@@ -23,13 +23,13 @@ from enact_dist.bench.cases.payloads import run_fetch, run_publish, run_wakeup
 from enact_dist.bench.cases.pipeline import run_pipeline
 from enact_dist.bench.cases.security import run_security
 from enact_dist.bench.cases.updates import run_durable, run_multi, run_update, run_waiters
-from enact_dist.bench.cases.view import run_view
 from enact_dist.bench.cases.workcell import run_workcell
 from enact_dist.bench.floors import Floors
 from enact_dist.bench.place import EMBEDDED, Place
 from enact_dist.bench.rows import Row, shown_spread, shown_us
 from enact_dist.bench.run import Answer, PackingOptions, Run
 from enact_dist.bench.tables import table
+from enact_dist.bench.view.case import run_view
 from enact_dist.bench.visit import PEAK_BYTES, without_room
 from enact_dist.cli.text.benches import BENCHES as TOLD
 from enact_dist.cli.text.output import print_json, print_table

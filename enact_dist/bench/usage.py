@@ -113,13 +113,13 @@ def _used(pids: Sequence[int]) -> Used:
     return Used(cpu_s, found["private"], found["shared"])
 
 
-def thread_seconds(pid: int) -> Counter[str]:
-    """Return the processor time of the threads of a process by their names, seconds."""
+def threads_ns(pid: int) -> Counter[str]:
+    """Return the processor time of the threads of a process by their names, nanoseconds."""
     found: Counter[str] = Counter()
     for task in Path(f"/proc/{pid}/task").iterdir():
         with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # ended meanwhile
             on_ns = int((task / "schedstat").read_text().split()[0])
-            found[(task / "comm").read_text().strip()] += on_ns / 1e9
+            found[(task / "comm").read_text().strip()] += on_ns
     return found
 
 

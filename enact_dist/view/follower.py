@@ -9,7 +9,6 @@ from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Final
 
-
 NICER: Final = 5
 """How much lower than that of the cell the priority of the view's threads is: who looks waits."""
 

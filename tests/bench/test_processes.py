@@ -1,5 +1,7 @@
 """The processes of benches: raw floors answer, the pipeline takes sets of one tick."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -20,6 +22,7 @@ from enact_dist.bench.command import BENCHES
 from enact_dist.bench.floors import ECHO, FDATASYNC, PUBLISH, QUERY, Floors
 from enact_dist.bench.place import EMBEDDED, Place, environment
 from enact_dist.bench.run import Run
+from enact_dist.bench.view import case as view
 from enact_dist.core.protocol.datum import Slot
 from enact_dist.errors import MisuseError
 
@@ -75,6 +78,25 @@ def test_security_compares_a_cell_with_keys_to_a_plain_one(new_run):
         assert rows[f"{name}, plain"].ratio is None
         assert rows[f"{name}, keys, rules for 61 names"].ratio > 0
     assert rows["right, known"].median_us < rows["right, new, 1,000 rules"].median_us
+
+
+def test_the_view_is_measured_beside_the_same_cell_without_a_page(new_run, monkeypatch):
+    """Each update costs what the threads of the view take; no browser is needed."""
+    pytest.importorskip("viser")
+    monkeypatch.setattr(view, "ROUNDS", 1)
+    monkeypatch.setattr(view, "SETTLE_S", 0.0)
+    monkeypatch.setattr(view, "CHROMIUM", Path("/nowhere"))
+    run = new_run("auto")
+    run.seconds_s = 0.15
+    view.run_view(run)
+
+    rows = {row.variant: row for row in run.rows()}
+    parts = [row.value for name, row in rows.items() if name.startswith("of it: ")]
+    assert len(parts) == len(view.PARTS) + 1
+    assert sum(parts) == pytest.approx(rows["processor time of an update"].value, abs=0.05)
+    assert rows["first picture after the command"].value > 0
+    assert rows["growth of memory after 20 s"].note == "too short to tell"
+    assert rows["updates shown in Chromium, drawn in software"].note.endswith("missing")
 
 
 def test_every_kind_of_floor_gives_times(new_run):

@@ -4,7 +4,7 @@ from unittest.mock import MagicMock
 
 import numpy as np
 
-from enact_dist.view.drawing.nodes import AxesNode, LabelNode, PointsNode
+from enact_dist.view.drawing.nodes import AxesNode, FrustumNode, LabelNode, PointsNode
 from enact_dist.view.drawing.scene import SceneView
 from enact_dist.view.pages.canvas import Canvas
 
@@ -55,3 +55,16 @@ def test_points_of_one_colour_are_moved_and_others_sent_again():
         added.append(cloud.call_count)
     assert added == [1, 1, 2, 3, 4, 5]
     assert cloud.return_value.points.shape == (6, 3)
+
+
+def test_images_have_as_many_pixels_as_the_page_shows_of_them():
+    """A frustum of the size of the scene: far away few are seen, and close to it all."""
+    client = MagicMock()
+    client.camera.fov, client.camera.image_height = 0.8, 850
+    canvas = Canvas(client)
+    canvas.draw({"": scene(FrustumNode("camera/1", 1.0, 4 / 3, None, (0, 0, 0)))})
+    sides = []
+    for away_m in (10.0, 0.8, 0.4, 0.0):
+        client.camera.position = (away_m, 0.0, 0.0)
+        sides.append(canvas.sides_px()["camera/1"])
+    assert sides == [160, 320, 640, 640]

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from view_samples import ARM, POSE, SHOWS, SLOT, SPEED, SPEED_SLOT, move, until
 
-from enact_dist import Entity, Lock, Write
+from enact_dist import Aspect, Entity, Lock, Write
 from enact_dist.access.snapshot import HeldView
-from enact_dist.config.shows import GUESSED
+from enact_dist.config.shows import GUESSED, Shows
 from enact_dist.core.protocol.datum import Slot
 from enact_dist.errors import ConfigError, MisuseError, UnknownWorldError
 from enact_dist.recording import Recorder
@@ -108,6 +108,33 @@ def test_what_the_past_has_shown_is_not_fetched_again(cell, monkeypatch):
     assert fetched == [2, 1]
     assert again[SPEED_SLOT] is found[SPEED_SLOT]
     assert decode_untyped(again[SLOT].datum)[0, 3] == 2.0
+
+
+def test_images_of_many_cameras_come_in_turns(cell, monkeypatch):
+    """At first all at once; then those of four cameras in a round, the longest not shown first."""
+    online, image = cell.world("online"), Aspect("image", np.ndarray)
+    eyes = [Entity(f"camera/{number}") for number in range(6)]
+    slots = [Slot("online", str(eye), "image") for eye in eyes]
+    source, asked = CellSource(cell), []
+    real = source.data_at
+    monkeypatch.setattr(source, "data_at", lambda *a, **b: asked.append(a[0]) or real(*a, **b))
+    for eye in eyes:
+        online.init(eye, image, np.zeros((4, 4, 3), np.uint8))
+    feed = Feed(source, lambda _: Shows(("image",)), rate_hz=50.0, bytes_s=1e9)
+    feed.start()
+    try:
+        feed.wish("page", slots)
+        until(lambda: len(feed.shown(slots)) == 6)
+        writes = [Write(online, eye, image) for eye in eyes]
+        first = len(asked)
+        with Lock(*writes) as lock:
+            for write in writes:
+                lock[write] = np.ones((4, 4, 3), np.uint8)
+        until(lambda: all(one.value.any() for one in feed.shown(slots).values()))
+        assert [len(each) for each in asked[first:]] == [4, 2]
+        assert {slot for each in asked[first:] for slot in each} == set(slots)
+    finally:
+        feed.stop()
 
 
 def test_an_odd_datum_is_named_and_takes_no_other_with_it(cell, feed, monkeypatch):

@@ -131,6 +131,7 @@ def test_joints_of_another_robot_are_named(file, positions, options, said):
         ("<robot", "is no URDF"),
         ("<robot name='a'/>", "it has no link"),
         ("<world/>", "is no URDF"),
+        ("<mujoco model='arm'/>", "is MJCF: robots are read from URDF alone"),
         (ROBOT.replace('child link="upper"', 'child link="lower"'), "is no URDF|cannot be drawn"),
         (with_mesh("hand.stl"), "the link 'thumb' has no mesh 'hand.stl'"),
         (with_mesh("robot.urdf"), "cannot be drawn"),

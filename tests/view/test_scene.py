@@ -4,6 +4,7 @@ import struct
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from io import BytesIO
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from hypothesis.extra import numpy as nps
 from view_samples import shown, slot
 
 from enact_dist.errors import ConfigError
+from enact_dist.recording.drawing import solids
 from enact_dist.recording.drawing.solids import outer_voxels, voxel_faces
 from enact_dist.view.drawing import scene as scenes
 from enact_dist.view.drawing.files import ply_of, png_of
@@ -154,10 +156,12 @@ def test_many_voxels_are_square_points():
     assert len(node.points_m) == 16**3 - 14**3
 
 
+@pytest.mark.parametrize("dense_times", [0, solids.DENSE_TIMES])
 @given(nps.arrays(np.int16, st.tuples(st.integers(0, 60), st.just(3)), elements=st.integers(0, 4)))
-def test_voxels_that_are_left_out_have_no_face(voxels):
-    """All faces of a set of voxels are faces of its outer ones."""
-    outer = outer_voxels(voxels)
+def test_voxels_that_are_left_out_have_no_face(dense_times, voxels):
+    """All faces of a set of voxels are faces of its outer ones, voxel by voxel or as a grid."""
+    with patch.object(solids, "DENSE_TIMES", dense_times):
+        outer = outer_voxels(voxels)
     there = {tuple(each) for each in voxels.tolist()}
     steps = [moved_by for axis in np.eye(3, dtype=int) for moved_by in (axis, -axis)]
     expected = {
@@ -364,6 +368,21 @@ def test_images_of_numbers_are_grey(pixels, corner):
 def test_a_large_image_is_made_small():
     node = one_node(shown(np.zeros((480, 640, 3), np.uint8), "image"))
     assert node.image.shape == (240, 320, 3)
+
+
+def test_an_image_is_as_large_as_its_side_asks_and_its_packed_mask_fits_it():
+    """Of a mask that is packed along its rows no more is unpacked than is shown."""
+    covers = np.zeros((48, 64), bool)
+    covers[8:24, 16:40] = True
+    image = shown(np.full((48, 64, 3), 100, np.uint8), "image", entity="camera/1")
+    packed = {"packed": np.packbits(covers, axis=1)}
+    mask = shown(packed, "mask", entity="camera/1", aspect="mask")
+    assert (mask.drawables["mask"].pixels == 255 * covers).all()
+    data = {one.recorded.slot: one for one in (image, mask)}
+    for side_px, step in ((64, 1), (32, 2), (16, 4)):
+        (node,) = scene_of(data, sides_px={"camera/1": side_px}).nodes.values()
+        red = (node.image == (177, 75, 65)).all(axis=2)
+        assert (red == covers[::step, ::step]).all()
 
 
 # ---------------------------------------------------------------- poses, labels, files

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 ROBOTS_MAX: Final = 16
 """Files that stay loaded."""
+OTHER_FORMATS: Final = {"mujoco": "MJCF", "sdf": "SDF", "COLLADA": "COLLADA"}
+"""Formats of robots that are not read, by the first element of their files."""
 LINK_COLOUR: Final = (190, 192, 198)
 """Of shapes whose material has none."""
 
@@ -143,9 +145,15 @@ def _loaded(file: Path) -> Any:
 
     find = partial(yourdfpy.filename_handler_magic, dir=str(file.parent))
     try:
-        etree.parse(str(file))  # yourdfpy itself guesses what broken XML means
+        root = etree.parse(str(file)).getroot()  # yourdfpy guesses what broken XML means
+        if root.tag in OTHER_FORMATS:
+            raise ConfigError(
+                f"{file} is {OTHER_FORMATS[root.tag]}: robots are read from URDF alone"
+            )
         model = yourdfpy.URDF.load(str(file), build_scene_graph=False, load_meshes=False)
         wrong = [] if model.validate() else list(map(str, model.errors))
+    except ConfigError:
+        raise
     except Exception as error:
         why = f"{type(error).__name__}: {error}"
         raise ConfigError(f"{file} is no URDF: {why}") from error

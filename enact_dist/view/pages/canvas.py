@@ -313,7 +313,7 @@ def _side_of(node: FrustumNode) -> float:
     """Return the longer side of a frustum's image in its scale: viser keeps the volume as it is."""
     y = math.tan(node.field_rad / 2.0)
     x = y * node.aspect
-    return 2.0 * max(x, y) / (x * y / 3.0) ** (1.0 / 3.0)
+    return 2.0 * max(x, y) / math.cbrt(x * y / 3.0)
 
 
 def _is_same(before: Node, node: Node) -> bool:

@@ -1,4 +1,4 @@
-"""A process of the view's bench: `python -m enact_dist.bench.cases.view_worker CELL ROLE OPTIONS`.
+"""A process of the view's bench: `python -m enact_dist.bench.view.worker CELL ROLE {}`.
 
 ========  =======================================================================================
 writer    writes at 10 Hz images and masks of eight cameras, a hull and two robots
@@ -21,8 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-
-from numpy.typing import NDArray  # noqa: TC002 - fields of data types are resolved
+from numpy.typing import NDArray
 
 from enact_dist.access.lock import Lock
 from enact_dist.bench.place import WORLD
@@ -151,7 +150,7 @@ def robot_of(number: int, tick: int) -> NDArray[np.float32]:
 # ---------------------------------------------------------------- roles in the cell
 
 
-def _write(world: WorldContext, options: dict[str, Any]) -> None:
+def _write(world: WorldContext) -> None:
     cameras = [Entity(f"camera/{number}") for number in range(CAMERAS)]
     frames = [frames_of(number) for number in range(CAMERAS)]
     hulls = [hull_of(frame) for frame in range(FRAMES)]
@@ -177,8 +176,8 @@ def _write(world: WorldContext, options: dict[str, Any]) -> None:
             for writes, seen in zip(filmed, frames, strict=True)
         ]
         groups += [((write, robot_of(n, tick)),) for n, write in enumerate(robots)]
-        for group in (*groups, ((hull, hulls[frame]),)):
-            commits.append((due_ns, _put(due_ns, *group)))
+        groups.append(((hull, hulls[frame]),))
+        commits.extend((due_ns, _put(due_ns, *group)) for group in groups)
         tick += 1
     print("did:", json.dumps(commits), flush=True)
 
@@ -192,7 +191,7 @@ def _put(stamp_ns: int, *data: tuple[Write[Any], Any]) -> int:
     return time.perf_counter_ns() - begun_ns
 
 
-def _follow(world: WorldContext, options: dict[str, Any]) -> None:
+def _follow(world: WorldContext) -> None:
     views = [View(world, Entity(f"camera/{number}"), IMAGE) for number in range(CAMERAS)]
     late: list[tuple[int, int]] = []
     print("ready:", flush=True)
@@ -270,7 +269,7 @@ def _read_page(url: str, stopped: threading.Event) -> Iterator[tuple[int, int]]:
                 yield time.perf_counter_ns(), len(message)
 
 
-def _page(_options: dict[str, Any]) -> None:
+def _page() -> None:
     import websockets.sync.client  # noqa: F401 - its import is no part of a first picture
 
     _camera_message()
@@ -291,7 +290,7 @@ _FRAMES: Final = """() => { window.enactFrames = 0;
 _SAID: Final = "() => (document.body.innerText.match(/([0-9.]+) updates/) || [])[1] || ''"
 
 
-def _browse(_options: dict[str, Any]) -> None:
+def _browse() -> None:
     from playwright.sync_api import sync_playwright
 
     flags = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
@@ -320,11 +319,11 @@ def _browse(_options: dict[str, Any]) -> None:
         browser.close()
 
 
-_IN_CELL: Final[dict[str, Callable[[WorldContext, dict[str, Any]], None]]] = {
+_IN_CELL: Final[dict[str, Callable[[WorldContext], None]]] = {
     "writer": _write,
     "follower": _follow,
 }
-_BEFORE_PAGE: Final[dict[str, Callable[[dict[str, Any]], None]]] = {
+_BEFORE_PAGE: Final[dict[str, Callable[[], None]]] = {
     "page": _page,
     "browser": _browse,
 }
@@ -332,13 +331,12 @@ _BEFORE_PAGE: Final[dict[str, Callable[[dict[str, Any]], None]]] = {
 
 def main(words: Sequence[str]) -> None:
     """Play one role until the parent ends this process."""
-    target, role, text = words
-    options = json.loads(text)
+    target, role, _options = words
     if role in _BEFORE_PAGE:
-        _BEFORE_PAGE[role](options)
+        _BEFORE_PAGE[role]()
         return
     with connect(target, actor=f"bench-{role}", timeout_s=20.0) as cell:
-        _IN_CELL[role](cell.create_world(WORLD), options)
+        _IN_CELL[role](cell.create_world(WORLD))
 
 
 if __name__ == "__main__":
