@@ -87,6 +87,16 @@ def test_an_outage_of_the_database_counts_for_nothing(standby):
     assert standby.is_free(HELD, 30 * S + (LEASE_NS + OUTAGE_NS) * 103 // 100)
 
 
+def test_the_time_of_slow_looks_does_not_count(standby):
+    """The holder's beats waited as long; what lies between such looks counts all the same."""
+    assert not standby.is_free(HELD, 10 * S)
+    for ended_s in (12, 14, 16):
+        standby.stood_still(3 * S // 2)
+        assert not standby.is_free(HELD, ended_s * S)
+    assert not standby.is_free(HELD, 16 * S + S // 2)
+    assert standby.is_free(HELD, 16 * S + 6 * S // 10)
+
+
 def test_a_holder_that_came_back_has_its_usual_lease(standby):
     """The time to connect again is over once a beat was seen."""
     standby.was_away()

@@ -154,6 +154,10 @@ class Standby:
         self._seen = None
         self._wait_ns = waited_ns(self._lease_ns + OUTAGE_NS)
 
+    def stood_still(self, for_ns: int) -> None:
+        """Leave out a time in which the database kept a look waiting, and the holder's beats, too."""
+        self._since_ns += for_ns
+
     def is_free(self, row: HolderRow, now_ns: int) -> bool:
         """Whether no process can answer for the shard, as of a look that ended at `now_ns`."""
         if self._seen != (row.epoch, row.beat):
