@@ -100,7 +100,7 @@ class Stalls:
         if stalled_s is not None and writing_since_s != stalled_s:
             self._writing_since_s = None
             _log.warning(
-                "the disk of shard %s writes again after %.1f s", self._shard, now_s - stalled_s
+                "the store of shard %s writes again after %.1f s", self._shard, now_s - stalled_s
             )
         elif (
             stalled_s is None and writing_since_s is not None and now_s - writing_since_s >= STALL_S
@@ -108,7 +108,7 @@ class Stalls:
             self._writing_since_s = writing_since_s
             self._count("disk_stalls")
             _log.warning(
-                "the disk of shard %s has written nothing for %.1f s; commits and new clients wait",
+                "the store of shard %s has written nothing for %.1f s; commits and new clients wait",
                 self._shard,
                 now_s - writing_since_s,
             )
