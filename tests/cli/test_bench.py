@@ -218,7 +218,7 @@ def test_help_says_of_every_bench_what_it_measures(enact, capsys, words):
     assert [words[0] for words in said] == list(command.BENCHES)
     assert all(len(words) > 4 for words in said)
     text = " ".join(" ".join(shown).split())
-    assert text.count("not --embedded") == len(command.BETWEEN_PROCESSES) == 7
+    assert text.count("not --embedded") == len(command.BETWEEN_PROCESSES) == 8
     assert text.count("not --connect,") == len(command.OWN_DAEMONS) - 1
     assert "stands still [not --embedded]" in text
     assert max(map(len, shown)) < 100

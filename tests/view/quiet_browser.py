@@ -66,5 +66,6 @@ class QuietClient:
         return contextlib.nullcontext()
 
     def status(self):
-        """Return what the page says at its top."""
-        return self.gui.handles["html 0"].content
+        """Return what the page says at its top, "" before it is built."""
+        top = self.gui.handles.get("html 0")
+        return top.content if top is not None else ""
