@@ -108,7 +108,8 @@ class Stalls:
             self._writing_since_s = writing_since_s
             self._count("disk_stalls")
             _log.warning(
-                "the store of shard %s has written nothing for %.1f s; commits and new clients wait",
+                "the store of shard %s has written nothing for %.1f s: commits and new clients"
+                " wait",
                 self._shard,
                 now_s - writing_since_s,
             )

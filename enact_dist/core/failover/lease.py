@@ -155,7 +155,7 @@ class Standby:
         self._wait_ns = waited_ns(self._lease_ns + OUTAGE_NS)
 
     def stood_still(self, for_ns: int) -> None:
-        """Leave out a time in which the database kept a look waiting, and the holder's beats, too."""
+        """Leave out a time in which the database kept a look waiting, and so the holder's beats."""
         self._since_ns += for_ns
 
     def is_free(self, row: HolderRow, now_ns: int) -> bool:
