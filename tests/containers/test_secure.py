@@ -9,7 +9,7 @@ pytest.importorskip("open3d", exc_type=ImportError)
 
 from stack import PACKAGES, Stack, judged
 
-pytestmark = pytest.mark.containers
+pytestmark = [pytest.mark.containers, pytest.mark.sampled(1, of="profiles in containers")]
 
 PLAIN = "deploy/compose.yaml"
 SWITCH = f"{PLAIN}:deploy/compose.secure.yaml"

@@ -13,7 +13,7 @@ pytest.importorskip("open3d", exc_type=ImportError)
 
 from stack import PACKAGES, Stack, judged, until
 
-pytestmark = pytest.mark.containers
+pytestmark = [pytest.mark.containers, pytest.mark.sampled(1, of="profiles in containers")]
 
 SWITCH = "deploy/compose.yaml:deploy/compose.survive.yaml"
 DATABASE = ("db-a", "db-b")
