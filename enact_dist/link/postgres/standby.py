@@ -70,7 +70,7 @@ class StandbyWatch:
             if not self._slow:
                 _log.warning(
                     "a look at the shard's row took %.1f s, more than half of lease_s (%g s): this"
-                    " standby leaves the time of such looks out, and takes over later",
+                    " standby does not count the rest of the time, and takes over later",
                     took_s, lease_s,
                 )  # fmt: skip
             self._slow, self._longest_s = self._slow + 1, max(self._longest_s, took_s)
@@ -126,7 +126,7 @@ def wait_free(
                     shard, seen = _look(session, address)
                 took_s = time.monotonic() - began_s
                 if watch.is_stale(took_s, address.lease_s):
-                    standby.stood_still(round(took_s * 1e9))
+                    standby.stood_still(round((took_s - address.lease_s / 2) * 1e9))
                 if seen.holder:
                     named = _named(session, shard, watch.figures, named)
                 if standby.is_free(seen, time.monotonic_ns()):
