@@ -40,7 +40,11 @@ def add_one(cell, aspect=COUNT):
 
 
 def disk_lines(caplog):
-    return [record.getMessage() for record in caplog.records if "disk" in record.getMessage()]
+    return [
+        record.getMessage()
+        for record in caplog.records
+        if "the store of shard" in record.getMessage()
+    ]
 
 
 def test_commit_that_the_disk_still_works_on_says_so(daemon, endpoint, tmp_path, disk, monkeypatch):
