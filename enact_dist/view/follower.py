@@ -14,11 +14,14 @@ NICER: Final = 5
 
 
 def stand_back(name: str) -> None:
-    """Lower the priority of the calling thread, and name it for `top -H`: its first 15 letters."""
+    """Lower the priority of the calling thread, and name it for `top -H`: its first 15 letters.
+
+    Idempotent: it counts from the main thread, since a thread begins with what its maker has.
+    """
     with contextlib.suppress(OSError):  # Linux alone has both
         Path("/proc/thread-self/comm").write_text(name)
-        at = threading.get_native_id()
-        os.setpriority(os.PRIO_PROCESS, at, os.getpriority(os.PRIO_PROCESS, at) + NICER)
+        own = os.getpriority(os.PRIO_PROCESS, os.getpid())
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), own + NICER)
 
 
 class Follower(ABC):
