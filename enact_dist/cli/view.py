@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 PORT: Final = 8080
 ANSWER_S: Final = 2.0
 """How long a shard is waited for: a page goes on without one that has gone."""
+
 TOKEN_VARIABLE: Final = "ENACT_VIEW_TOKEN"  # noqa: S105 - its name
 
 

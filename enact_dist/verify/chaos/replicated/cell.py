@@ -32,10 +32,10 @@ LOST: Final = {
     "the database warned": "the database warned",
     "SQLSTATE 53": "the database's disk is full",
 }
+"""Why a daemon may end by itself: what its last words contain, and what the report calls it."""
 _CRITICAL: Final = " CRITICAL "
 _AWAY: Final = "and the shard ends: what it has not acknowledged"
 """Last words of a daemon that is ended in good order while the database cannot be reached."""
-"""Why a daemon may end by itself: what its last words contain, and what the report calls it."""
 AS_ORDERED: Final = "as ordered"
 UNEXPECTED_END: Final = "a daemon ended for no reason that it may have"
 
