@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import pytest
 from accounts import COUNT, LEFT, RIGHT, open_accounts, start_trapped, two_trapped_shards
 
-from enact_dist import Lock, Read, View, Write, connect, local
+from enact_dist import Aspect, Durability, Lock, Read, View, Write, connect, local
 from enact_dist.core.protocol.messages import Commit
 from enact_dist.errors import (
     ChangedError,
@@ -278,3 +278,40 @@ def test_unknown_commit_can_be_asked_about_when_its_shard_is_back(
             assert seen(other, LEFT, RIGHT) == [3, 4]
         with pytest.raises(MisuseError, match="names no lock"):
             mine.outcome("somebody")
+
+
+class DiesUnheard(DeafTo):
+    """A carrier whose shard is killed, and started again, before its first commit is answered."""
+
+    def __init__(self, inner, cell):
+        super().__init__(inner)
+        self._cell = cell
+
+    def request(self, shard, message, *, timeout_s, **more):
+        before = self.lost
+        answer = super().request(shard, message, timeout_s=timeout_s, **more)
+        if self.lost > before:
+            self._cell.kill()
+            self._cell.start()
+        return answer
+
+
+@pytest.mark.parametrize("durability", [Durability.VOLATILE, Durability.OS])
+def test_commit_that_a_restart_may_have_taken_is_not_told_lost(make_cell, durability):
+    """A shard that lost its record of a commit answers *unknown*, now and later; else it knows."""
+    daemons = make_cell(ttl_s=TTL_S).start_all()
+    with connect(daemons.file) as mine, connect(daemons.file) as other:
+        count = Write(mine.world("online"), LEFT, Aspect("count", int, durability))
+        mine.world("online").init(LEFT, count.aspect, 0)
+        mine._client.carrier = DiesUnheard(mine._client.carrier, daemons)
+        if durability is Durability.OS:
+            with Lock(count) as lock:
+                lock[count] = 1
+            assert lock.position.shard == "s0"
+            assert seen(other, LEFT) == [1]
+            return
+        with pytest.raises(CommitUnknownError, match="lost its record") as caught, Lock(count) as lock:  # fmt: skip
+            lock[count] = 1
+        for cell in (mine, other):
+            with pytest.raises(CommitUnknownError, match="no longer knows"):
+                cell.outcome(caught.value.lock_id)

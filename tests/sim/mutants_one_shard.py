@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from enact_dist.core.client import lock as multilock
 from enact_dist.core.client.client import Client
+from enact_dist.core.client.finishing import Finishing
 from enact_dist.core.client.lease_clock import SENDINGS_KEPT, Sendings
 from enact_dist.core.client.lock import MultiLock
 from enact_dist.core.client.plan import Phase
@@ -202,7 +203,7 @@ def skips_validation(patch: Patch) -> None:
     after_votes = MultiLock._after_votes
 
     def wrong(self: MultiLock) -> None:
-        finishing = self._finishing
+        finishing = self.finishing
         assert finishing is not None
         for shard in [shard for shard in finishing.left if shard not in finishing.writes]:
             del finishing.left[shard]
@@ -247,6 +248,11 @@ def retries_with_another_commit(patch: Patch) -> None:
     """A client that hears nothing takes its lock for lost and its thread starts over."""
     patch(multilock, "RETRY_NS_MIN", 1)
     patch(MultiLock, "_on_outcome", lambda lock, _answer, _now_ns: lock._end(Phase.LOST))
+
+
+def takes_a_commit_without_record_for_lost(patch: Patch) -> None:
+    """A client takes the silence of a restarted shard for the word that nothing was committed."""
+    patch(Finishing, "known_in", lambda _self, _recorded: 0)
 
 
 def shows_before_it_is_kept(patch: Patch) -> None:

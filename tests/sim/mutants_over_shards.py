@@ -84,7 +84,7 @@ def commits_without_votes(patch: Patch) -> None:
     """A client commits though a participant has not prepared yet."""
 
     def wrong(self: MultiLock) -> None:
-        if self._finishing is not None and self._finishing.primary:
+        if self.finishing is not None and self.finishing.primary:
             self.phase = Phase.COMMITTING
         else:
             after_votes(self)

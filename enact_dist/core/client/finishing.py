@@ -24,8 +24,10 @@ from enact_dist.core.protocol.messages import (
     Prepare,
     SlotVersion,
     Validate,
+    WriteItem,
 )
 from enact_dist.core.protocol.placement import shard_of
+from enact_dist.core.state.clock import is_kept
 from enact_dist.errors import SHARD_RESTARTED
 
 if TYPE_CHECKING:
@@ -41,7 +43,6 @@ if TYPE_CHECKING:
         PlacementMap,
         Prepared,
         Request,
-        WriteItem,
     )
 
 
@@ -57,6 +58,7 @@ class Finishing:
         reads_left_out: How many data more than these were read.
         prepared: What the other writing shards have answered.
         pending: Whether the last word about the commit was that its shard still works on it.
+        unanswered: Whether a copy of the commit got no answer, so it may have taken effect.
     """
 
     lock: LockId
@@ -71,6 +73,7 @@ class Finishing:
     ask_outcome: bool = False
     sent: bool = False
     pending: bool = False
+    unanswered: bool = False
 
     def __post_init__(self) -> None:
         self.primary = min(self.writes, default="")
@@ -121,12 +124,53 @@ class Finishing:
             keeping.used_ns(now_ns) if keeping is not None else 0,
         )
 
-    def not_committed(self, answer: OutcomeIs, cause: str) -> tuple[Phase | None, str]:
-        """Return what an outcome that is no commit means, None if the lock goes on, and why."""
+    def silent(self, request: Request) -> None:
+        """The primary did not answer: ask for the outcome before anything is sent again."""
+        self.ask_outcome, self.pending = True, False
+        self.unanswered |= isinstance(request, Commit)
+
+    def known_in(self, recorded: frozenset[str]) -> int:
+        """Return the epoch of the primary that alone can know the outcome; 0: later ones can, too.
+
+        Args:
+            recorded: The aspects whose commits the primary still knows after a restart.
+        """
+        epoch = self.token.epoch
+        aspects = {slot.aspect for slot, _ in self.writes[self.primary]}
+        kept = is_kept(epoch) and (self.prepared or not recorded.isdisjoint(aspects))
+        return 0 if kept else epoch
+
+    def drop_data(self, *, slots: bool) -> None:
+        """Forget the data, which may be large, while the program may keep the lock.
+
+        Args:
+            slots: Whether to forget the slots, too: the commit stands.
+        """
+        kept = {} if slots else self.writes
+        self.writes = {
+            shard: tuple([WriteItem(slot, None) for slot, _ in writes])
+            for shard, writes in kept.items()
+        }
+
+    def not_committed(
+        self, answer: OutcomeIs, cause: str, recorded: frozenset[str]
+    ) -> tuple[Phase | None, str]:
+        """Return what an outcome that is no commit means, None if the lock goes on, and why.
+
+        Args:
+            answer: The outcome, as the primary knows it.
+            cause: What is known so far.
+            recorded: As in `known_in`.
+        """
         self.pending = answer.kind == OUTCOME_PENDING
         if answer.kind == OUTCOME_EXPIRED:
             return Phase.UNKNOWN, "its shard has no record of this session any more"
         if not self.pending and answer.epoch != self.token.epoch:
+            if self.unanswered and self.known_in(recorded):
+                return (
+                    Phase.UNKNOWN,
+                    f"{SHARD_RESTARTED}, which lost its record of the commit, if there was one",
+                )
             return Phase.LOST, f"{SHARD_RESTARTED} before the commit arrived"
         self.ask_outcome = self.pending  # else it never arrived: send it (again)
         return None, cause

@@ -104,7 +104,7 @@ class MultiLock:
     keeping: Keeping | None = None  # if its grant may stay with the session
     news: AwaitedNews | None = None  # what it waits for before it enters the queue
     waited_ns: int = 0  # in the queue of the last shard
-    _finishing: Finishing | None = None
+    finishing: Finishing | None = None
     _free_calls: int = FREE_CALLS
     _retry_at_ns: int = 0
     _retry_ns: int = RETRY_NS_MIN
@@ -139,7 +139,7 @@ class MultiLock:
     def _calls(self, now_ns: int) -> list[tuple[str, Request]]:
         if self.cut is not None and self.phase is Phase.VIEWING:
             return self.cut.calls(self.lock, self.client, self.plan.placement.version, now_ns)
-        finishing = self._finishing
+        finishing = self.finishing
         assert finishing is not None
         if self.phase is Phase.VALIDATING:
             return finishing.votes_to_ask(self.client.seen_stamp_ns, keep=self.keeping is not None)
@@ -202,7 +202,7 @@ class MultiLock:
             self.refusal = max(answer, self.refusal, key=lambda each: each.oldest_ns)
         elif isinstance(answer, Refused | Forgotten):
             code = answer.code if isinstance(answer, Refused) else ""
-            if code == NO_PAYLOAD and self._finishing and self._finishing.unname(request):
+            if code == NO_PAYLOAD and self.finishing and self.finishing.unname(request):
                 self.unnamed = True
                 return  # asked again, with the bytes
             self._end(Phase.REFUSED)
@@ -222,8 +222,8 @@ class MultiLock:
     def _silent(self, shard: str, request: Request, now_ns: int) -> None:
         self.silent_shard = shard
         self._free_calls = 0
-        if isinstance(request, _DECIDERS) and self._finishing is not None:
-            self._finishing.ask_outcome, self._finishing.pending = True, False
+        if isinstance(request, _DECIDERS) and self.finishing is not None:
+            self.finishing.silent(request)
         self._pause(now_ns)
 
     def _pause(self, now_ns: int) -> None:
@@ -237,7 +237,7 @@ class MultiLock:
     def _epoch_changed(self, shard: str, request: Request) -> None:
         """The shard restarted or forgot the session; `client` has dropped our grants there."""
         self._free_calls = max(0, self._free_calls - 1)
-        finishing = self._finishing
+        finishing = self.finishing
         if isinstance(request, _DECIDERS) and finishing is not None:
             finishing.ask_outcome = True
         elif isinstance(request, Validate | Prepare) and finishing and shard in finishing.left:
@@ -312,7 +312,7 @@ class MultiLock:
     @property
     def sent_commit(self) -> bool:
         """Whether the commit that decides has been sent: only its shard knows then."""
-        return self._finishing is not None and self._finishing.sent
+        return self.finishing is not None and self.finishing.sent
 
     @property
     def no_cut(self) -> bool:
@@ -321,7 +321,7 @@ class MultiLock:
 
     def lose_at(self, shard: str, cause: str) -> None:
         """A shard has dropped the grant there; what it has prepared it keeps (and says so)."""
-        if self._finishing is None or shard == self._finishing.primary:
+        if self.finishing is None or shard == self.finishing.primary:
             self.lose(cause)
 
     def lose(self, cause: str, *, asked_of: Part | None = None) -> None:
@@ -352,8 +352,8 @@ class MultiLock:
     def _gives_up(self) -> None:
         """The deadline has passed: rest in what that means in this phase."""
         if self.phase is Phase.COMMITTING:
-            if self._finishing is not None and self._finishing.pending:
-                primary = self._finishing.primary
+            if self.finishing is not None and self.finishing.pending:
+                primary = self.finishing.primary
                 self.cause = f"shard {primary} still works on it: its disk has not kept it yet"
             self._end(Phase.UNKNOWN if self.sent_commit else Phase.UNREACHABLE)
         elif self.phase is Phase.VALIDATING or self.silent_shard:
@@ -364,12 +364,12 @@ class MultiLock:
     def _end(self, phase: Phase) -> None:
         """Rest in `phase`; whatever may still be held or awaited is given back."""
         self.phase = phase
-        keeping, sent = self.keeping, self._finishing is not None
+        keeping, sent = self.keeping, self.finishing is not None
         if keeping is not None and keeping.ends(phase, self.parts[0], sent=sent):
             self.client.ended(self)
             return
-        if self._finishing is not None:
-            self._finishing.writes = {}  # they may be large, and the program may keep the lock
+        if self.finishing is not None:
+            self.finishing.drop_data(slots=phase is Phase.COMMITTED)
         if phase not in (Phase.COMMITTED, Phase.UNKNOWN):
             touched = [part.shard for part in self.parts]
             touched += [shard for shard, _ in self.plan.views if shard not in touched]
@@ -406,7 +406,7 @@ class MultiLock:
         viewed = {shard: self._epoch_viewed(shard) for shard in expected} if expected else {}
         written = {shard: tuple(items) for shard, items in writes.items() if items}
         tokens, reads = tokens_of(self.parts, viewed), tuple(reads)
-        self._finishing = Finishing(self.lock, tokens, written, expected, reads, reads_left_out)
+        self.finishing = Finishing(self.lock, tokens, written, expected, reads, reads_left_out)
         self.phase = Phase.VALIDATING
         self._after_votes()
 
@@ -425,7 +425,7 @@ class MultiLock:
         return next((r.epoch for r in self.states if r.shard == shard), self.client.epoch(shard))
 
     def _after_votes(self) -> None:
-        finishing = self._finishing
+        finishing = self.finishing
         if finishing is None or finishing.left:
             return
         if finishing.primary:
@@ -437,13 +437,13 @@ class MultiLock:
             self._end(Phase.COMMITTED)
 
     def _on_vote(self, shard: str, answer: Answer) -> None:
-        assert self._finishing is not None
-        if shard not in self._finishing.left:
+        assert self.finishing is not None
+        if shard not in self.finishing.left:
             return
         if isinstance(answer, Valid | Prepared):
-            del self._finishing.left[shard]
+            del self.finishing.left[shard]
             if isinstance(answer, Prepared):
-                self._finishing.prepared[shard] = answer
+                self.finishing.prepared[shard] = answer
                 self.client.saw_stamp(answer.stamp_ns)
             elif self.keeping is not None:
                 self.keeping.told(answer.kept, self)
@@ -454,7 +454,7 @@ class MultiLock:
             self._changed(answer)
 
     def _changed(self, answer: Changed) -> None:
-        self.moved = self._finishing.moved(answer) if self._finishing is not None else None
+        self.moved = self.finishing.moved(answer) if self.finishing is not None else None
         how = f"has moved on to version {answer.version} since it was viewed"
         self.cause = f"{answer.slot} {how if self.moved else 'is about to be written'}"
         self._end(Phase.CHANGED)
@@ -473,27 +473,28 @@ class MultiLock:
             self._on_outcome(answer, now_ns)
 
     def _on_outcome(self, answer: OutcomeIs, now_ns: int) -> None:
-        finishing = self._finishing
+        finishing = self.finishing
         assert finishing is not None
         if self.keeping is not None:
             self.keeping.grant = None
         if answer.kind == OUTCOME_COMMITTED:
             self._committed(answer.position, answer.versions)
             return
-        phase, self.cause = finishing.not_committed(answer, self.cause)
+        recorded = self.client.peer(finishing.primary).recorded
+        phase, self.cause = finishing.not_committed(answer, self.cause, recorded)
         if phase is not None:
             self._end(phase)
         elif finishing.pending:
             self._pause(now_ns)
 
     def _committed(self, position: Position, versions: tuple[SlotVersion, ...]) -> None:
-        assert self._finishing is not None
+        assert self.finishing is not None
         self.position, self.versions = position, versions
         self.client.saw_stamp(position.stamp_ns)
         if self.keeping is not None and self.keeping.grant is not None:
-            writes = self._finishing.writes[self._finishing.primary]
+            writes = self.finishing.writes[self.finishing.primary]
             self.keeping.grant.committed(writes, versions, position.stamp_ns)
-        if prepared := self._finishing.prepared:
+        if prepared := self.finishing.prepared:
             self.versions += tuple([v for vote in prepared.values() for v in vote.versions])
             self.client.committed(prepared, position.stamp_ns)
         self._end(Phase.COMMITTED)

@@ -32,6 +32,7 @@ from enact_dist.core.protocol.messages import (
     Welcome,
 )
 from enact_dist.core.state.clock import STAMP_NS_MAX
+from enact_dist.terms import Durability
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -65,11 +66,13 @@ L = TypeVar("L", bound=HeldThere)
 class Peer:
     """What this client knows of one shard.
 
-    `successions` is how many successions of datum types its newest known catalogue has.
+    `successions` is how many successions of datum types its newest known catalogue has; `recorded`
+    are the aspects whose commits it still knows after a restart.
     """
 
     epoch: int = 0
     successions: int = 0
+    recorded: frozenset[str] = frozenset()
 
 
 class ClientSession(Generic[L]):
@@ -196,6 +199,13 @@ class ClientSession(Generic[L]):
             self._enters(shard, answer.epoch, acknowledged=first and answer.open)
         elif request.known_epoch == answer.epoch:
             self._enters(shard, answer.epoch, acknowledged=True)
+        peer.recorded = frozenset(
+            [
+                name
+                for name, _, durability, *_ in answer.aspects
+                if durability != Durability.VOLATILE.value
+            ]
+        )
         self.ttl_ns = min(self.ttl_ns, answer.ttl_ns)
         self.learn_placement(answer.placement)
 

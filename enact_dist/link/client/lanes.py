@@ -16,19 +16,28 @@ from enact_dist.core.state.sessions import LANES_MAX
 from enact_dist.errors import MisuseError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from enact_dist.core.client.lock import MultiLock
 
-_NAME: Final = re.compile(r"(?P<session>[^.@]+)\.(?P<lane>\d+)\.(?P<seq>\d+)@(?P<shard>.+)\Z")
-
-
-def name_of(lock: LockId, writes: Mapping[str, Sequence[object]]) -> str:
-    """Return the name of a lock that commits `writes`, by shard: the lowest shard decides."""
-    primary = min((shard for shard, items in writes.items() if items), default="")
-    return f"{lock.session}.{lock.lane}.{lock.seq}@{primary}" if primary else str(lock)
+_NAME: Final = re.compile(
+    r"(?P<session>[^.@]+)\.(?P<lane>\d+)\.(?P<seq>\d+)@(?P<shard>[^~]+)(~(?P<epoch>\d{1,19}))?\Z"
+)
 
 
-def read_name(name: str) -> tuple[LockId, str]:
-    """Return the lock of a name, and the shard that decides on it.
+def name_of(multilock: MultiLock) -> str:
+    """Return the name of a lock and of the shard that decides whether it commits.
+
+    An epoch stands behind them if a restart takes the shard's record of the commit.
+    """
+    lock, finishing = multilock.lock, multilock.finishing
+    if finishing is None or not finishing.primary:
+        return str(lock)
+    epoch = finishing.known_in(multilock.client.peer(finishing.primary).recorded)
+    name = f"{lock.session}.{lock.lane}.{lock.seq}@{finishing.primary}"
+    return f"{name}~{epoch}" if epoch else name
+
+
+def read_name(name: str) -> tuple[LockId, str, int]:
+    """Return the lock of a name, its deciding shard, and the epoch that alone knows (0: any).
 
     Raises:
         MisuseError: The name is invalid.
@@ -36,7 +45,8 @@ def read_name(name: str) -> tuple[LockId, str]:
     found = _NAME.match(name)
     if found is None:
         raise MisuseError(f"{name!r} names no lock; use the lock_id of a CommitUnknownError")
-    return LockId(found["session"], int(found["lane"]), int(found["seq"])), found["shard"]
+    lock = LockId(found["session"], int(found["lane"]), int(found["seq"]))
+    return lock, found["shard"], int(found["epoch"] or 0)
 
 
 KEPT_MAX: Final = 64

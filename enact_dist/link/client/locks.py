@@ -360,11 +360,11 @@ class CellClient(SessionClient):
                     raise
                 # The cell was closed, or the answer could not be read: the commit may stand.
                 lock.phase, lock.cause = Phase.UNKNOWN, f"then: {error}"
-                raise self._not_committed(lock, writes, started_ns) from error
+                raise self._not_committed(lock, started_ns) from error
             if lock.phase is not Phase.COMMITTED:
                 if lock.phase is not Phase.UNKNOWN:
                     drop_staged(self, named)
-                raise self._not_committed(lock, writes, started_ns)
+                raise self._not_committed(lock, started_ns)
         finally:
             self.release(lock)  # only the lane, unless something broke in between
 
@@ -380,18 +380,15 @@ class CellClient(SessionClient):
             lock.release()
             self.check_usable()
 
-    def _not_committed(
-        self, lock: MultiLock, writes: Mapping[str, Sequence[WriteItem]], started_ns: int
-    ) -> EnactError:
+    def _not_committed(self, lock: MultiLock, started_ns: int) -> EnactError:
         waited_s = (self._now_ns() - started_ns) / 1e9
         self._ask_cause(lock)
         self._ask_who(lock)
-        name = name_of(lock.lock, writes)
-        return not_committed(lock, waited_s, self.carrier, name=name)
+        return not_committed(lock, waited_s, self.carrier, name=name_of(lock))
 
     def outcome(self, name: str, *, timeout_s: float) -> Position | None:
         """Ask for the outcome of a commit; see `Cell.outcome`."""
-        lock, shard = read_name(name)
+        lock, shard, known_in = read_name(name)
         if shard not in self.shards():
             raise MisuseError(f"{name!r} names shard {shard}; there are {', '.join(self.shards())}")
         deadline_ns = self._now_ns() + int(timeout_s * 1e9)
@@ -403,7 +400,8 @@ class CellClient(SessionClient):
             kind = answer.kind if isinstance(answer, OutcomeIs) else ""
             if isinstance(answer, OutcomeIs) and kind == OUTCOME_COMMITTED:
                 return answer.position
-            if kind == OUTCOME_UNSEEN:
+            forgot = isinstance(answer, OutcomeIs) and known_in not in (0, answer.epoch)
+            if kind == OUTCOME_UNSEEN and not forgot:
                 if isinstance(released, Refused):  # its session lives, so it may still be sent
                     raise error_of(released)
                 return None

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from enact_dist.core.client.plan import Phase
 from enact_dist.core.protocol.messages import Forgotten
-from enact_dist.terms import Access, Durability
+from enact_dist.terms import Durability
 from enact_dist.verify.simulation.cells import CONTEXTS
 from enact_dist.verify.simulation.judges.history import TOLD_NOT, Entry, conflict
 
@@ -121,7 +121,7 @@ class ClientJudge:
         applied = applied or entry.id in self._observed.permitted_losses
         if entry.told is Phase.COMMITTED and entry.lock.versions and not applied:
             self._fail("I5 told committed, not visible", entry.id)
-        if entry.told in TOLD_NOT and applied and not self._may_be_gone(entry):
+        if entry.told in TOLD_NOT and applied and entry.id not in self._observed.permitted_losses:
             self._fail("I5 told not committed, but visible", entry.id, entry.told, entry.lock.cause)
 
         if entry.told is Phase.COMMITTED:
@@ -145,14 +145,6 @@ class ClientJudge:
             picture = self._observed.pictures[part.shard]
             if part.token != picture.confirmed.get(entry.id):
                 self._fail("P3 every lock is confirmed", entry.id, part.shard, part.token)
-
-    def _may_be_gone(self, entry: Entry) -> bool:
-        """Whether a restart may have undone the lock's writes: volatile, or `os` and power cut."""
-        written = (item for item in entry.items if Access(item.access).writes)
-        volatile = all(
-            self._observed.durabilities[item.aspect] is Durability.VOLATILE for item in written
-        )
-        return volatile or entry.id in self._observed.permitted_losses
 
 
 def _believed(host: ClientNode) -> list[MultiLock]:
