@@ -1,7 +1,6 @@
 """Shards killed at each step of a commit over shards, with a standby of each: all or nothing."""
 
 import contextlib
-import os
 import sys
 import time
 
@@ -12,14 +11,11 @@ from standing_cell import TRAPPED, StandingCell
 sys.path.append(str(TRAPPED))
 
 from accounts import PINS
-from decision_rounds import STEP_AT, DecisionRounds, figures_to
+from decision_rounds import BUSY_S, STEP_AT, DecisionRounds
 
 from enact_dist.link.client import locks as link_client
 
 pytestmark = [pytest.mark.slow, pytest.mark.sampled(2)]
-ROUNDS = int(os.environ.get("ENACT_DECISION_KILLS", "4"))
-BUSY_S = 25.0
-"""What a machine that does other things may add; locks that no shard frees stay for ever."""
 TAKEOVER_S = 3.0
 TTL_S = 1.0
 
@@ -63,12 +59,6 @@ def cell(pair, tmp_path, shard_name):
 def test_a_commit_is_all_or_nothing_when_standbys_take_over_at(step, cell, monkeypatch):
     """Primary or participant or both die; the client learns the truth, and locks are free soon."""
     monkeypatch.setattr(link_client, "FINISH_S", link_client.FINISH_S)  # undoes what rounds set
-    rounds = TakenOver(cell, step, ttl_s=TTL_S, seed=len(step))
-    try:
-        for number in range(ROUNDS):
-            rounds.run(number)
-    finally:
-        rounds.close()
-        figures_to(rounds.tally.line(step, TTL_S) if rounds.tally.rounds else f"{step}: no round")
+    longest_s = TakenOver(cell, step, ttl_s=TTL_S, seed=len(step)).play()
 
-    assert max(rounds.tally.free_s) <= TAKEOVER_S + TTL_S + BUSY_S, rounds.tally.free_s
+    assert longest_s <= TAKEOVER_S + TTL_S + BUSY_S
