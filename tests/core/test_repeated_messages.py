@@ -178,6 +178,7 @@ def changes(run, when):
             yield f"{index} {delivery.message}: {changed}"
 
 
+@pytest.mark.sampled(16)
 @pytest.mark.parametrize("when", When, ids=lambda when: when.name.lower())
 @pytest.mark.parametrize("run", RUNS, ids=lambda run: run.__name__)
 def test_message_that_comes_again_changes_nothing(run, when):
