@@ -17,7 +17,7 @@ from actors.palletizing.simulation.products import PRODUCTS, product_mesh
 
 from .moves import carton
 
-pytestmark = pytest.mark.sampled(8, of="file")
+pytestmark = pytest.mark.sampled(5, of="file")
 
 
 class Belt:
