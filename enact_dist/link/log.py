@@ -5,7 +5,8 @@ field    of a line of `--log json`
 =======  ==========================================================================================
 time     seconds since 1970, a number
 level    "DEBUG", "INFO", "WARNING", "ERROR" or "CRITICAL"
-logger   the part that logs: "enact.shard", "enact.store", "enact.link", "enact.actor", …
+logger   the part that logs: "enact.shard", "enact.store", "enact.link", "enact.actor", …, or
+         "psycopg", the driver of a cell's database
 event    what happened, in names that programs may rely on ("lock.taken", "shard.stop"); empty
          if the line is only for people
 text     the line for people
@@ -183,11 +184,13 @@ class Log:
         self._handler = _BoundedHandler(self._lines)
         self._thread = threading.Thread(target=self._write, name="enact-log", daemon=True)
         self._logger = logging.getLogger("enact")
+        self._driver = logging.getLogger("psycopg")  # its warnings are no other's to format
 
     def __enter__(self) -> None:
         self._level = self._logger.level
         self._logger.setLevel(logging.INFO)
-        self._logger.addHandler(self._handler)
+        for logger in (self._logger, self._driver):
+            logger.addHandler(self._handler)
         self._thread.start()
 
     def _write(self) -> None:
@@ -213,7 +216,8 @@ class Log:
     def __exit__(self, *_: object) -> None:
         if self._handler.lost:
             _log.warning("%d lines of this log were lost", self._handler.lost)
-        self._logger.removeHandler(self._handler)
+        for logger in (self._logger, self._driver):
+            logger.removeHandler(self._handler)
         self._logger.setLevel(self._level)
         with suppress(queue.Full):
             self._lines.put_nowait(None)

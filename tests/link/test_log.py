@@ -49,6 +49,23 @@ def test_line_that_cannot_be_made_is_told_and_ends_no_log(monkeypatch):
     assert found[0]["process"] == found[1]["process"] == "actor mine"
 
 
+def test_lines_of_the_database_driver_are_lines_of_the_log(monkeypatch):
+    """Warnings that no handler takes are written without time, level and source."""
+    near, far = socket.socketpair()
+    driver = logging.getLogger("psycopg")
+    with near, far, near.makefile() as lines:
+        monkeypatch.setattr(log, "STDERR", far.fileno())
+        near.settimeout(10.0)
+        with Log(JsonLines(cell="line", process="shard left")):
+            driver.warning("query cancellation failed: %s", "the server is gone")
+            found = json.loads(lines.readline())
+
+    assert (found["logger"], found["level"]) == ("psycopg", "WARNING")
+    assert found["text"] == "query cancellation failed: the server is gone"
+    assert found["process"] == "shard left"
+    assert not driver.handlers
+
+
 FORGED = "a\n2026-01-01 00:00:00,000 CRITICAL enact.shard \x1b[2Jstops \u202e"
 
 
