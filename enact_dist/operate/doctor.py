@@ -229,7 +229,7 @@ def _cell(
             yield _unreachable("cell", target)
             return kept
         for known in config.shards:
-            yield _unreachable(f"shard {known.name}", known.advertise[0])
+            yield _unreachable(f"shard {known.name}", ", ".join(known.advertise))
         yield fail("cell", str(error), f"enact up {target}")
     except EnactError as error:
         yield fail("cell", f"{type(error).__name__}: {error}")

@@ -114,6 +114,22 @@ def test_knock_tells_why_nobody_answers():
     )
 
 
+def test_each_endpoint_of_a_silent_shard_is_knocked_at():
+    """Two hosts may serve it: each has a reason of its own, and no remedy is told twice."""
+    with socket.create_server(("127.0.0.1", 0)) as stranger:
+        port = stranger.getsockname()[1]
+        places = f"tcp/127.0.0.1:{port}", "tcp/127.0.0.1:9", "tcp/127.0.0.1:7"
+        silent = ShardInfo("s0", ", ".join(places), reachable=False)
+        (found,) = doctor._shard(silent)
+
+    assert (found.level, found.subject) == (Level.FAIL, "shard s0")
+    assert f"at {places[0]}, something listens, but it is no shard of this cell" in found.text
+    assert f"at {places[1]}, nothing listens at port 9" in found.text
+    assert f"at {places[2]}, nothing listens at port 7" in found.text
+    assert found.remedy.count("start the shard") == 1
+    assert f"see what runs at port {port}" in found.remedy
+
+
 def test_doctor_reports_each_shard_of_a_running_cell(enact, cell_file):
     """All is well: status 0, and a line for each shard and its clock."""
     result = enact("doctor", "--cell", cell_file, "--json")
