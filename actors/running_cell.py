@@ -196,18 +196,9 @@ class RunningCell(DemoCell):
 
     def _leave_database(self) -> None:
         """Delete what the cell had in its database."""
-        import psycopg  # of an extra, which only a store needs
-
-        statement = """
-            WITH gone AS (DELETE FROM enact.shard WHERE cell = %s RETURNING id),
-            rows AS (DELETE FROM enact.record USING gone WHERE shard = gone.id)
-            DELETE FROM enact.body USING gone WHERE shard = gone.id"""
-        name = tomllib.loads(self.config.read_text())["name"]
-        try:
-            with psycopg.connect(self._store, connect_timeout=10) as connection:
-                connection.execute(statement, (name,))
-        except psycopg.Error as error:
-            _LOG.warning("the rows of cell %s stay in the database: %s", name, error)
+        erase = ("shard", "erase", "--yes", "--cell", str(self.config))
+        if self._run(*erase).wait():
+            _LOG.warning("rows of this run may be left in the database; see %s", self._log)
 
     def joined(self) -> contextlib.AbstractContextManager[Cell]:
         """Join the cell as soon as its shards answer; their standbys start then.

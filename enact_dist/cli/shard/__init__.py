@@ -223,4 +223,18 @@ VERBS: Final = (
         ),
         page="surviving",
     ),
+    Verb(
+        "erase", "delete all that the database has of stopped shards", "store:run_erase",
+        "enact shard erase left --cell cell.toml\n"
+        "enact shard erase left --yes --cell cell.toml",
+        (
+            option("shards", "SHARD", "name of a shard (default: all that the database has)",
+                   nargs="*"),
+            flag("--yes", "delete it; without this option the command lists it, with status 1"),
+            CELL_FILE,
+            JSON,
+        ),
+        columns=("shard", "epoch", "newest batch", "rows"),
+        page="surviving",
+    ),
 )  # fmt: skip

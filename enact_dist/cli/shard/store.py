@@ -1,4 +1,4 @@
-"""`enact shard restored|export-store|import-store`: work on a store in a database."""
+"""`enact shard restored|export-store|import-store|erase`: work on a store in a database."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from enact_dist.cli.shard.shard import refuse_password
 from enact_dist.cli.target import cell_config
 from enact_dist.cli.text.output import ProgressLine, shown_bytes
-from enact_dist.cli.verbs import Output
+from enact_dist.cli.verbs import DONE, FAILED, Output
 from enact_dist.config.types import without_password
 from enact_dist.errors import ConfigError
 from enact_dist.link.postgres.address import StoreAddress, require_driver
@@ -44,6 +44,23 @@ def run_restored(options: argparse.Namespace) -> Output:
         {"shards": [each._asdict() for each in raised], "not_in_database": new},
         text,
         rows=[(r.shard, r.before, r.epoch, r.batch, r.holder or "-") for r in raised],
+    )
+
+
+def run_erase(options: argparse.Namespace) -> Output:
+    """Delete what the database has of shards; without `--yes`, list it with status 1."""
+    config = cell_config(options)
+    address = StoreAddress(_url(config), config.name, "", config.lease_s)
+    from enact_dist.link.offline.database import erase_database
+
+    found = erase_database(address, options.shards, dry_run=not options.yes)
+    return Output(
+        {"done": options.yes, "shards": [each._asdict() for each in found]},
+        "erased, with all history; such a shard begins empty"
+        if options.yes
+        else "nothing was changed; say --yes to erase them",
+        rows=found,
+        status=DONE if options.yes else FAILED,
     )
 
 

@@ -1,4 +1,4 @@
-"""Changes all shards of a stopped cell in its database together: moves entities, purges aspects.
+"""Changes shards of a stopped cell in its database together: moves, purges, erases.
 
 One transaction holds the rows of the shards, reads everything, and writes everything.  So no daemon
 takes a shard meanwhile, and a run that is cut off has changed nothing: there are no marks, and
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from contextlib import closing, contextmanager
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import psycopg
 from psycopg.types.numeric import Int8
@@ -27,13 +27,14 @@ from enact_dist.link.postgres.connection import CONFIRMED, connector_of
 from enact_dist.link.postgres.medium import database_errors, send_batch
 from enact_dist.link.postgres.opening import read_whole
 from enact_dist.link.postgres.restored import idle_rows, refuse_served, rows_of_cell
-from enact_dist.link.postgres.tables import FENCE, MISSING, make_tables
+from enact_dist.link.postgres.tables import ERASE, FENCE, MISSING, SHARDS, make_tables
 from enact_dist.link.store.store import Store
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
     from contextlib import AbstractContextManager
 
+    from enact_dist.core.failover.lease import HolderRow
     from enact_dist.core.protocol.messages import PlacementMap
     from enact_dist.core.protocol.records import Recovered
     from enact_dist.link.folder.blobs import Blob
@@ -83,45 +84,79 @@ class _SharedMedium:
         return database_errors(self.name)
 
 
+class ErasedShard(NamedTuple):
+    """What a database had of a shard.
+
+    Attributes:
+        shard: Its name.
+        epoch: Its last epoch.
+        batch: Number of its newest batch.
+        rows: How many rows of data it had.
+    """
+
+    shard: str
+    epoch: int
+    batch: int
+    rows: int
+
+
+@contextmanager
+def _idle(
+    cell: StoreAddress, progress: Progress | PurgeProgress, only: Collection[str]
+) -> Iterator[tuple[DatabaseSession, Callable[[], dict[str, tuple[int, HolderRow]]]]]:
+    """Wait until no daemon serves; yield a transaction, and what locks the shards' rows in it."""
+    name = _named(cell)
+    with database_errors(name), closing(connector_of(cell).connect()) as session:
+        if session.row(MISSING) != (None,):
+            raise StoreError(f"{name} has no data of shards (no schema enact)", path=name)
+        progress.act("look for daemons")
+        seen = idle_rows(session, cell.cell, only, name, cell.lease_s, remedy=_STOP)
+
+        def locked() -> dict[str, tuple[int, HolderRow]]:
+            held = rows_of_cell(session, cell.cell, only, name, " FOR UPDATE")
+            changed = [s for s, (_, row) in held.items() if s in seen and seen[s][1] != row]
+            refuse_served(changed, held, name, _STOP)
+            return held
+
+        session.commit_as(CONFIRMED)
+        with session.connection.transaction():
+            yield session, locked
+        session.check()
+
+
+def _named(cell: StoreAddress) -> str:
+    return f"{without_password(cell.url)} (cell {cell.cell})"
+
+
 @contextmanager
 def _opened(
     cell: StoreAddress, progress: Progress | PurgeProgress, only: Collection[str],
     new: Collection[str], *, unix_s: int, dry_run: bool,
 ) -> Iterator[tuple[dict[str, Store], dict[str, Recovered]]]:  # fmt: skip
     """Open shards of a cell in one transaction, in one new epoch; yield stores and contents."""
-    name = f"{without_password(cell.url)} (cell {cell.cell})"
-    with database_errors(name), closing(connector_of(cell).connect()) as session:
-        if session.row(MISSING) != (None,):
-            raise StoreError(f"{name} has no data of shards (no schema enact)", path=name)
-        progress.act("look for daemons")
-        seen = idle_rows(session, cell.cell, only, name, cell.lease_s, remedy=_STOP)
-        session.commit_as(CONFIRMED)
-        with session.connection.transaction():
-            session.connection.execute("SET LOCAL idle_in_transaction_session_timeout = '10min'")
-            for shard in new:
-                make_tables(session, cell.cell, shard)
-            held = rows_of_cell(session, cell.cell, only, name, " FOR UPDATE")
-            changed = [s for s, (_, row) in held.items() if s in seen and seen[s][1] != row]
-            refuse_served(changed, held, name, _STOP)
-            epoch = max(unix_s, *(row.epoch + 1 for _, row in held.values()))
-            stores: dict[str, Store] = {}
-            stored: dict[str, Recovered] = {}
-            for shard, (row_id, row) in held.items():
-                if not row.epoch and shard not in new:
-                    continue  # a daemon has looked for it, and never served it
-                progress.act(f"open {shard}")
-                session.row(FENCE, (Int8(epoch), "", row_id))
-                place = str(StoreAddress(cell.url, cell.cell, shard))
-                contents = read_whole(session, row_id, row.batch, place)
-                contents.recovered.epoch = epoch
-                medium = _SharedMedium(session, row_id, epoch, place)
-                stores[shard] = Store(medium, contents, wall_ns=unix_s * 1_000_000_000)
-                stored[shard] = contents.recovered
-            yield stores, stored
-            progress.act("commit")
-            if dry_run:
-                raise psycopg.Rollback
-        session.check()
+    with _idle(cell, progress, only) as (session, locked):
+        session.connection.execute("SET LOCAL idle_in_transaction_session_timeout = '10min'")
+        for shard in new:
+            make_tables(session, cell.cell, shard)
+        held = locked()
+        epoch = max(unix_s, *(row.epoch + 1 for _, row in held.values()))
+        stores: dict[str, Store] = {}
+        stored: dict[str, Recovered] = {}
+        for shard, (row_id, row) in held.items():
+            if not row.epoch and shard not in new:
+                continue  # a daemon has looked for it, and never served it
+            progress.act(f"open {shard}")
+            session.row(FENCE, (Int8(epoch), "", row_id))
+            place = str(StoreAddress(cell.url, cell.cell, shard))
+            contents = read_whole(session, row_id, row.batch, place)
+            contents.recovered.epoch = epoch
+            medium = _SharedMedium(session, row_id, epoch, place)
+            stores[shard] = Store(medium, contents, wall_ns=unix_s * 1_000_000_000)
+            stored[shard] = contents.recovered
+        yield stores, stored
+        progress.act("commit")
+        if dry_run:
+            raise psycopg.Rollback
 
 
 def rebalance_database(
@@ -207,3 +242,39 @@ def forget_database(
                     progress.act(f"forget on {name}")
                     write(stores[name], some)
     return found
+
+
+def shards_in_database(cell: StoreAddress) -> list[str]:
+    """Return the shards that a database has of a cell; the address's shard does not matter.
+
+    Raises:
+        StoreError: The database cannot be used.
+    """
+    with database_errors(_named(cell)), closing(connector_of(cell).connect()) as session:
+        if session.row(MISSING) != (None,):
+            return []
+        found = session.connection.execute(SHARDS.encode(), (cell.cell,)).fetchall()
+        return [name for _, name, *_ in found]
+
+
+def erase_database(
+    cell: StoreAddress, only: Collection[str] = (), *, dry_run: bool = False
+) -> list[ErasedShard]:
+    """Delete all that a database has of shards; all or none.
+
+    Args:
+        cell: The database and the cell; the shard does not matter.
+        only: The shards; empty: all that the database has of the cell.
+        dry_run: Whether to change nothing.
+
+    Raises:
+        StoreError: A daemon serves one, there is no such shard, or the database cannot be used.
+    """
+    with _idle(cell, SILENT, only) as (session, locked):
+        erased = []
+        for shard, (row_id, row) in locked().items():
+            (rows,) = session.row(ERASE, (Int8(row_id),)) or (0,)
+            erased.append(ErasedShard(shard, row.epoch, row.batch, rows))
+        if dry_run:
+            raise psycopg.Rollback
+    return erased

@@ -128,6 +128,12 @@ FROM pg_stat_replication
 SHARDS: Final = """
 SELECT id, name, epoch, batch, beat, holder FROM enact.shard WHERE cell = %b ORDER BY name
 """
+ERASE: Final = """
+WITH gone AS (DELETE FROM enact.shard WHERE id = %b RETURNING id),
+    rows AS (DELETE FROM enact.record USING gone WHERE shard = gone.id RETURNING 1),
+    parts AS (DELETE FROM enact.body USING gone WHERE shard = gone.id)
+SELECT count(*) FROM rows
+"""
 NAME_ME: Final = "SELECT set_config('application_name', %s, false)"
 STANDBYS: Final = """
 SELECT application_name FROM pg_stat_activity WHERE datname = current_database()

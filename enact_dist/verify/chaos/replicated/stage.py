@@ -6,8 +6,8 @@ import os
 import time
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from enact_dist.config.types import without_password
-from enact_dist.errors import LinkError
+from enact_dist.errors import LinkError, StoreError
+from enact_dist.link.postgres.address import StoreAddress, require_driver
 from enact_dist.verify.chaos.faults import StagedRun
 from enact_dist.verify.chaos.network.hosts import Loopback, Namespaces
 from enact_dist.verify.chaos.replicated.cell import ReplicatedCell
@@ -29,11 +29,6 @@ NODES: Final = "nodes"
 LEASE_S: Final = 1.0
 _DATABASES: Final = ("d0", "d1")
 _PLACES: Final = ("h0", "h1")
-_FORGET: Final = """
-WITH gone AS (DELETE FROM enact.shard WHERE cell = %s RETURNING id),
-    rows AS (DELETE FROM enact.record USING gone WHERE shard = gone.id)
-DELETE FROM enact.body USING gone WHERE shard = gone.id
-"""
 
 
 def stage_replicated(
@@ -153,16 +148,12 @@ def _forget(store: str, cell: str) -> None:
     Raises:
         LinkError: The database cannot be used.
     """
+    address = StoreAddress(store, cell, "", LEASE_S)
     try:
-        import psycopg
-    except ImportError as error:
-        raise LinkError(f"the driver of PostgreSQL cannot be loaded: {error}") from error
-    try:
-        with psycopg.connect(
-            store, autocommit=True, connect_timeout=5, target_session_attrs="read-write"
-        ) as connection:
-            there = connection.execute("SELECT to_regclass('enact.body')").fetchone()
-            if there is not None and there[0] is not None:
-                connection.execute(_FORGET, (cell,))
-    except psycopg.Error as failure:
-        raise LinkError(f"{without_password(store)}: {failure}") from failure
+        require_driver(store)
+        from enact_dist.link.offline.database import erase_database, shards_in_database
+
+        if shards_in_database(address):
+            erase_database(address)
+    except StoreError as failure:
+        raise LinkError(str(failure)) from failure
