@@ -2,6 +2,7 @@
 
 import os
 import sys
+import time
 
 import pytest
 from postgres_nodes import USER, Node, make_folder
@@ -16,6 +17,8 @@ from enact_dist.verify.daemons import LineProcess
 pytestmark = [pytest.mark.slow, pytest.mark.sampled(1), pytest.mark.carrier("zenoh")]
 DATABASE, CLIENTS = "db", "clients"
 DAEMONS = ("a", "b")
+CLIENTS_OF_BOTH = 3
+"""Of two daemons that take requests, Zenoh lets each client ask one."""
 
 
 class HostsOfACell:
@@ -48,6 +51,13 @@ class HostsOfACell:
 
     def log(self, host):
         return (self._folder / f"{host}.log").read_text()
+
+    def await_log(self, host, text, within_s=60):
+        """Return once a daemon has said this."""
+        end_s = time.monotonic() + within_s
+        while text not in self.log(host):
+            assert time.monotonic() < end_s, self.log(host)
+            time.sleep(0.05)  # a file tells of no new lines
 
     def daemon(self, host, says):
         words = ["shard", "run", SHARD, "--cell", str(self._file), "--standby"]
@@ -98,20 +108,22 @@ def await_updates(clients):
 def test_a_daemon_that_hears_or_reaches_no_database_is_replaced(cell, lost, apart):
     """Whichever way is cut: no update is lost or counted twice.
 
-    The old daemon ends once it hears of the new one, from that or from the database; a client that
-    asks it meanwhile gets no answer.
+    The old daemon ends once it hears of the new one, from that or from the database; as long as it
+    hears of neither, clients that reach both ask the new one.
     """
     cuts = [lost, *([DAEMONS, DAEMONS[::-1]] if apart else [])]
     active = cell.daemon("a", READY)
     standby = cell.daemon("b", STANDS_BY)
-    clients = [cell.client(number) for number in range(2)]
+    clients = [cell.client(number) for number in range(CLIENTS_OF_BOTH)]
     await_updates(clients)
     for one in cuts:
         cell.hosts.cut(*one)
     standby.expect(READY)
-    if not apart:
+    if apart:
+        cell.await_log("a", "it takes no requests")
+    else:
         assert active.wait_status(60) == 1
-        await_updates(clients)
+    await_updates(clients)
     assert "answers wait" in cell.log("a")
     assert active.status == (None if apart else 1), cell.log("a")
     for one in cuts:
@@ -119,6 +131,25 @@ def test_a_daemon_that_hears_or_reaches_no_database_is_replaced(cell, lost, apar
     assert active.wait_status(60) == 1
     assert "has another holder" in cell.log("a")
     await_updates(clients)
+    for client in clients:
+        client.tell("end")
+        client.expect("right")
+
+
+def test_a_daemon_that_let_its_clients_go_takes_them_back(cell):
+    """It reaches neither its database nor a standby, and no other daemon takes the shard."""
+    active = cell.daemon("a", READY)
+    clients = [cell.client(number) for number in range(2)]
+    await_updates(clients)
+    cuts = [(DATABASE, "a"), ("a", DATABASE)]
+    for one in cuts:
+        cell.hosts.cut(*one)
+    cell.await_log("a", "it takes no requests")
+    for one in cuts:
+        cell.hosts.heal(*one)
+    await_updates(clients)
+    assert "the lease is renewed" in cell.log("a")
+    assert active.status is None
     for client in clients:
         client.tell("end")
         client.expect("right")

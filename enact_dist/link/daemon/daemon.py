@@ -124,7 +124,9 @@ class RunningShard:
             undo.callback(self._service.close)
             self._successor: Successor | None = None
             if self.host.silence is not None:
-                self._successor = Successor(self.host, settings, self._has_failed)
+                self._successor = Successor(
+                    self.host, settings, self._has_failed, lambda: self._service
+                )
                 undo.callback(self._successor.close)
                 self.host.silence.on_move(self._move)
             self._own_reload = Reload(settings.keys) if reload is None and settings.change else None

@@ -23,6 +23,7 @@ import logging
 import queue
 import threading
 import time
+from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import zenoh
@@ -123,12 +124,14 @@ class ZenohService:
             token_key(cell, ANY, ANY), zenoh.handlers.FifoChannel(QUEUED_MAX), history=True
         )
         self._token_events: zenoh.Handler[zenoh.Sample] = self._tokens.handler
-        self._queryable = session.declare_queryable(
-            queryable_key(cell, host.name), zenoh.handlers.FifoChannel(QUEUED_MAX), complete=True
+        self._declare = partial(
+            session.declare_queryable,
+            queryable_key(cell, host.name),
+            zenoh.handlers.FifoChannel(QUEUED_MAX),
+            complete=True,
         )
-        # The handlers, not their owners: owners cannot be undeclared while a thread waits on them,
-        # and afterwards have no handler for a thread that starts late.
-        self._inbox: zenoh.Handler[zenoh.Query] = self._queryable.handler
+        self._queryable: zenoh.Queryable[zenoh.Handler[zenoh.Query]] | None = None
+        self._serving = threading.Lock()
         self._turns = Turns[_Arrived]()
         self._logged: set[str] = set()
         self._resting = True
@@ -141,16 +144,41 @@ class ZenohService:
         self._staged_bytes = 0
         self._threads = [
             threading.Thread(target=run, name=name, daemon=True)
-            for name, run in (
-                ("enact-dispatch", self._dispatch),
-                ("enact-stage", self._stage),
-                ("enact-tokens", self._watch_tokens),
-            )
+            for name, run in (("enact-stage", self._stage), ("enact-tokens", self._watch_tokens))
         ]
         for thread in self._threads:
             thread.start()
+        self._dispatcher: threading.Thread | None = None
+        self.serve()
 
     # ---------------------------------------------------------------- requests
+
+    def serve(self) -> None:
+        """Take requests, after `withdraw` again; idempotent."""
+        with self._serving:
+            if self._closed or self._queryable is not None:
+                return
+            if self._dispatcher is not None:
+                self._dispatcher.join()
+            self._queryable = self._declare()
+            # The handlers, not their owners: owners cannot be undeclared while a thread waits on
+            # them, and afterwards have no handler for a thread that starts late.
+            self._inbox: zenoh.Handler[zenoh.Query] = self._queryable.handler
+            self._dispatcher = threading.Thread(
+                target=self._dispatch, name="enact-dispatch", daemon=True
+            )
+            self._dispatcher.start()
+
+    def withdraw(self) -> bool:
+        """Take no requests, so that clients ask another daemon; whether it took some before.
+
+        Clients stay connected, and so do their tokens: sessions and locks stay.
+        """
+        with self._serving:
+            queryable, self._queryable = self._queryable, None
+            if queryable is not None:
+                queryable.undeclare()  # type: ignore[no-untyped-call]  # untyped in its stub
+            return queryable is not None
 
     def _dispatch(self) -> None:
         """Serve the clients in turn until the queryable ends."""
@@ -168,7 +196,7 @@ class ZenohService:
                     if not self._left:
                         self._end_drain(self._marked)
         except zenoh.ZError:
-            if not self._closed:
+            if self._queryable is not None:
                 _log.critical("shard %s: its queryable ended unexpectedly", self._host.name)
         finally:
             self._resting = True
@@ -348,12 +376,13 @@ class ZenohService:
         self._closed = True
         self._unwatch()
         self._remove_inbox()
-        self._queryable.undeclare()  # type: ignore[no-untyped-call]  # untyped in its stub
+        self.withdraw()
         self._tokens.undeclare()  # type: ignore[no-untyped-call]  # untyped in its stub
         self.senders.close()
         self._staged.put(None)
-        for thread in self._threads:
-            thread.join(JOIN_S)
+        for thread in (self._dispatcher, *self._threads):
+            if thread is not None:
+                thread.join(JOIN_S)
 
 
 class _Arrived(NamedTuple):
