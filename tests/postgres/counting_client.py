@@ -1,9 +1,12 @@
 """A counting client as a process: `python -m counting_client CELL_FILE NUMBER`.
 
-A line ``next`` waits for an update that was asked for after it; ``end`` checks what was counted.
+A line ``next`` waits for an update that was asked for after it, for 60 s or as many as it says;
+``longest`` tells the longest pause between two updates, and what was raised; ``end`` checks what
+was counted.
 """
 
 import sys
+from itertools import pairwise
 
 from replicated_cell import Counting
 
@@ -16,7 +19,13 @@ def main():
             client.end()
             print("right", len(client.values), client.unknown, flush=True)
             return
-        print("next", client.next_update(60.0), flush=True)
+        if line.strip() == "longest":
+            pauses = [after - before for before, after in pairwise(client.done_s)]
+            kinds = sorted({type(error).__name__ for error in client.errors})
+            print("longest", max(pauses), *kinds, flush=True)
+            continue
+        wait_s = float(line.strip().removeprefix("next") or 60.0)
+        print("next", client.next_update(wait_s), flush=True)
     client.stop()
 
 
