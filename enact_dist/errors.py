@@ -191,6 +191,7 @@ class LeaseLostError(EnactError):
 class CommitUnknownError(EnactError):
     """The commit was sent and never answered; whether it took effect is unknown.
 
+    Its shard stayed away, or has lost its record of the commit in a restart (`volatile` data).
     The only error after which a write may be visible.
 
     Attributes:

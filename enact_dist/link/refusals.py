@@ -14,6 +14,7 @@ from enact_dist.core.client.plan import Phase
 from enact_dist.core.protocol.messages import PERMISSION, Forgotten, Refused
 from enact_dist.core.state.grants import HELD_TOO_LONG
 from enact_dist.errors import (
+    SHARD_RESTARTED,
     ChangedError,
     ClockSkewError,
     CommitUnknownError,
@@ -136,10 +137,10 @@ def not_committed(
         return error_of(lock.refusal)
     if lock.phase is Phase.UNKNOWN:
         why = lock.cause or f"no answer came for {finish_s:.1f} s"
+        ask = "" if why.startswith(SHARD_RESTARTED) else f", or ask later: cell.outcome({name!r})"
         return CommitUnknownError(
             f"the commit of lock {lock.lock} ({_wanted(lock)}) was sent, and {why}; whether it took"
-            " effect is unknown; read the data before writing them again, or ask later:"
-            f" cell.outcome({name!r})",
+            f" effect is unknown; read the data before writing them again{ask}",
             lock_id=name,
         )
     if lock.phase is Phase.UNREACHABLE:

@@ -242,8 +242,8 @@ class Cell(FormerNames, Closing):
             The position of the commit, or None if nothing was written.
 
         Raises:
-            CommitUnknownError: The shard does not know (any more): 64 later commits of the process
-                have ended in this error, too, or the process has been gone for a day.
+            CommitUnknownError: The shard does not know: a restart took its record, 64 later commits
+                of the process have ended in this error, too, or it has been gone for a day.
             PermissionDeniedError: The process that made the commit is alive; nothing is written
                 yet, and only that process can rule out that it will be.
             ShardUnreachableError: The shard does not answer.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from client_bench import ANSWER, NOTHING, REQUEST, CellBench, ClientBench
 from shard_bench import MS, TTL_NS, S, item, slot
@@ -9,10 +11,12 @@ from shard_bench import MS, TTL_NS, S, item, slot
 from enact_dist.core.client.plan import Phase
 from enact_dist.core.protocol.messages import (
     Acquire,
+    AspectEntry,
     Commit,
     Granted,
     Outcome,
     Refused,
+    Register,
 )
 from enact_dist.terms import Access
 
@@ -199,6 +203,40 @@ class TestRestart:
         ann.finish(lock, (slot(), "1"))
 
         assert lock.phase is Phase.COMMITTED
+
+    @pytest.mark.parametrize(("configured", "then"), [("os", "volatile"), ("volatile", "os")])
+    def test_durability_counts_under_which_a_commit_was_sent(self, cell, configured, then):
+        """A restart with another durability changes nothing about what was recorded before it."""
+        shard = cell.shards["s0"]
+        ann = cell.client("ann")
+        ann.call("s0", Register("ann", (), (AspectEntry("late", "int", configured),)))
+        lock = ann.locked(item(W, aspect="late"))
+
+        def lose(_shard: str, request: object) -> str:
+            if isinstance(request, Commit):
+                shard.settings = replace(shard.settings, aspects=(AspectEntry("late", "", then),))
+                shard.restart()
+                for _ in range(2):  # the client greets before it asks for the outcome
+                    ann.keep_alive()
+                return REQUEST
+            return NOTHING
+
+        ann.lose = lose
+        ann.finish(lock, (slot(aspect="late"), "1"))
+
+        assert lock.phase is (Phase.LOST if configured == "os" else Phase.UNKNOWN)
+
+    @pytest.mark.parametrize("durability", ["volatile", "os"])
+    def test_aspect_registered_since_the_greeting_counts_as_what_it_is(self, cell, durability):
+        """Whoever asks later about a commit without an answer learns that a restart did not take it."""
+        ann = cell.client("ann")
+        ann.call("s0", Register("ann", (), (AspectEntry("late", "int", durability),)))
+        lock = ann.locked(item(W, aspect="late"))
+        ann.lose = lambda _shard, _request: REQUEST
+        ann.finish(lock, (slot(aspect="late"), "1"), give_up_s=1.0)
+
+        assert lock.phase is Phase.UNKNOWN
+        assert lock.finishing.known_in == (1 if durability == "volatile" else 0)
 
     def test_grant_of_an_epoch_that_is_over_is_not_taken(self, cell):
         """A late grant is no grant: the client knows a newer epoch."""

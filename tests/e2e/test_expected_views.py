@@ -312,6 +312,43 @@ def test_commit_that_a_restart_may_have_taken_is_not_told_lost(make_cell, durabi
             return
         with pytest.raises(CommitUnknownError, match="lost its record") as caught, Lock(count) as lock:  # fmt: skip
             lock[count] = 1
+        assert "cell.outcome" not in str(caught.value)  # nobody will ever know
         for cell in (mine, other):
             with pytest.raises(CommitUnknownError, match="no longer knows"):
                 cell.outcome(caught.value.lock_id)
+
+
+class LosesCommits:
+    """A carrier that loses every commit on its way."""
+
+    def __init__(self, inner):
+        self._inner = inner
+
+    def __getattr__(self, name):
+        return getattr(self._inner, name)
+
+    def request(self, shard, message, *, timeout_s, **more):
+        if isinstance(message, Commit):
+            return None
+        return self._inner.request(shard, message, timeout_s=timeout_s, **more)
+
+
+@pytest.mark.parametrize("durability", [Durability.VOLATILE, Durability.OS])
+def test_restarted_shard_says_of_a_commit_that_it_would_have_recorded_that_it_never_came(
+    make_cell, monkeypatch, durability
+):
+    """Also of an aspect that the client registered after it had greeted the shard."""
+    monkeypatch.setattr(link_client, "FINISH_S", 0.5)
+    daemons = make_cell(ttl_s=TTL_S).start_all()
+    with connect(daemons.file) as mine:
+        count = Write(mine.world("online"), LEFT, Aspect("count", int, durability))
+        mine._client.carrier = LosesCommits(mine._client.carrier)
+        with pytest.raises(CommitUnknownError, match="no answer") as caught, Lock(count) as lock:
+            lock[count] = 1
+        daemons.kill()
+        daemons.start()
+        if durability is Durability.OS:
+            assert mine.outcome(caught.value.lock_id) is None
+        else:
+            with pytest.raises(CommitUnknownError, match="no longer knows"):
+                mine.outcome(caught.value.lock_id)

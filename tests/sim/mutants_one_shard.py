@@ -252,7 +252,7 @@ def retries_with_another_commit(patch: Patch) -> None:
 
 def takes_a_commit_without_record_for_lost(patch: Patch) -> None:
     """A client takes the silence of a restarted shard for the word that nothing was committed."""
-    patch(Finishing, "known_in", lambda _self, _recorded: 0)
+    patch(Finishing, "_known_in", lambda _self: 0)
 
 
 def shows_before_it_is_kept(patch: Patch) -> None:

@@ -24,7 +24,6 @@ from enact_dist.core.protocol.messages import (
     Prepare,
     SlotVersion,
     Validate,
-    WriteItem,
 )
 from enact_dist.core.protocol.placement import shard_of
 from enact_dist.core.state.clock import is_kept
@@ -43,6 +42,7 @@ if TYPE_CHECKING:
         PlacementMap,
         Prepared,
         Request,
+        WriteItem,
     )
 
 
@@ -59,6 +59,9 @@ class Finishing:
         prepared: What the other writing shards have answered.
         pending: Whether the last word about the commit was that its shard still works on it.
         unanswered: Whether a copy of the commit got no answer, so it may have taken effect.
+        recorded: The aspects whose commits the primary still knows after a restart.
+        known_in: Once it has ended: the epoch of the primary that alone can know whether the commit
+            that was sent took effect; 0: later ones can, too.
     """
 
     lock: LockId
@@ -74,6 +77,8 @@ class Finishing:
     sent: bool = False
     pending: bool = False
     unanswered: bool = False
+    recorded: frozenset[str] = frozenset()
+    known_in: int = 0
 
     def __post_init__(self) -> None:
         self.primary = min(self.writes, default="")
@@ -129,44 +134,30 @@ class Finishing:
         self.ask_outcome, self.pending = True, False
         self.unanswered |= isinstance(request, Commit)
 
-    def known_in(self, recorded: frozenset[str]) -> int:
-        """Return the epoch of the primary that alone can know the outcome; 0: later ones can, too.
-
-        Args:
-            recorded: The aspects whose commits the primary still knows after a restart.
-        """
+    def _known_in(self) -> int:
         epoch = self.token.epoch
         aspects = {slot.aspect for slot, _ in self.writes[self.primary]}
-        kept = is_kept(epoch) and (self.prepared or not recorded.isdisjoint(aspects))
+        kept = is_kept(epoch) and (self.prepared or not self.recorded.isdisjoint(aspects))
         return 0 if kept else epoch
 
-    def drop_data(self, *, slots: bool) -> None:
-        """Forget the data, which may be large, while the program may keep the lock.
+    def ends(self, phase: Phase) -> None:
+        """Forget the data, which may be large, while the program may keep the lock."""
+        if self.sent and phase is not Phase.COMMITTED:
+            self.known_in = self._known_in()
+        self.writes = {}
 
-        Args:
-            slots: Whether to forget the slots, too: the commit stands.
-        """
-        kept = {} if slots else self.writes
-        self.writes = {
-            shard: tuple([WriteItem(slot, None) for slot, _ in writes])
-            for shard, writes in kept.items()
-        }
-
-    def not_committed(
-        self, answer: OutcomeIs, cause: str, recorded: frozenset[str]
-    ) -> tuple[Phase | None, str]:
+    def not_committed(self, answer: OutcomeIs, cause: str) -> tuple[Phase | None, str]:
         """Return what an outcome that is no commit means, None if the lock goes on, and why.
 
         Args:
             answer: The outcome, as the primary knows it.
             cause: What is known so far.
-            recorded: As in `known_in`.
         """
         self.pending = answer.kind == OUTCOME_PENDING
         if answer.kind == OUTCOME_EXPIRED:
             return Phase.UNKNOWN, "its shard has no record of this session any more"
         if not self.pending and answer.epoch != self.token.epoch:
-            if self.unanswered and self.known_in(recorded):
+            if self.unanswered and self._known_in():
                 return (
                     Phase.UNKNOWN,
                     f"{SHARD_RESTARTED}, which lost its record of the commit, if there was one",

@@ -369,7 +369,7 @@ class MultiLock:
             self.client.ended(self)
             return
         if self.finishing is not None:
-            self.finishing.drop_data(slots=phase is Phase.COMMITTED)
+            self.finishing.ends(phase)
         if phase not in (Phase.COMMITTED, Phase.UNKNOWN):
             touched = [part.shard for part in self.parts]
             touched += [shard for shard, _ in self.plan.views if shard not in touched]
@@ -429,6 +429,7 @@ class MultiLock:
         if finishing is None or finishing.left:
             return
         if finishing.primary:
+            finishing.recorded = self.client.peers[finishing.primary].recorded
             self.phase = Phase.COMMITTING
         else:
             if not self.parts and any(r.state.large or r.state.same for r in self.states):
@@ -480,8 +481,7 @@ class MultiLock:
         if answer.kind == OUTCOME_COMMITTED:
             self._committed(answer.position, answer.versions)
             return
-        recorded = self.client.peer(finishing.primary).recorded
-        phase, self.cause = finishing.not_committed(answer, self.cause, recorded)
+        phase, self.cause = finishing.not_committed(answer, self.cause)
         if phase is not None:
             self._end(phase)
         elif finishing.pending:

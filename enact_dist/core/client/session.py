@@ -29,17 +29,18 @@ from enact_dist.core.protocol.messages import (
     KeepVersions,
     LaneView,
     PlacementMap,
+    Registered,
     Welcome,
 )
 from enact_dist.core.state.clock import STAMP_NS_MAX
 from enact_dist.terms import Durability
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
     from enact_dist.core.client.plan import Part, Plan
     from enact_dist.core.protocol.datum import LockId
-    from enact_dist.core.protocol.messages import DatumRead, Prepared, Request
+    from enact_dist.core.protocol.messages import AspectEntry, DatumRead, Prepared, Request
 
 
 class HeldThere(Protocol):
@@ -67,7 +68,7 @@ class Peer:
     """What this client knows of one shard.
 
     `successions` is how many successions of datum types its newest known catalogue has; `recorded`
-    are the aspects whose commits it still knows after a restart.
+    are the aspects that it has shown in this epoch whose commits it still knows after a restart.
     """
 
     epoch: int = 0
@@ -156,7 +157,9 @@ class ClientSession(Generic[L]):
 
     def _enters(self, shard: str, epoch: int, *, acknowledged: bool) -> None:
         """Note the epoch of a shard, and whether a `Hello` has confirmed it there."""
-        self.peer(shard).epoch = epoch
+        peer = self.peer(shard)
+        if epoch != peer.epoch:
+            peer.epoch, peer.recorded = epoch, frozenset()
         if acknowledged and epoch:
             self.greeted.add(shard)
         else:
@@ -185,6 +188,9 @@ class ClientSession(Generic[L]):
         if isinstance(answer, Alive) and isinstance(request, KeepAlive):
             self._alive(shard, request, answer, now_ns)
             return True
+        if isinstance(answer, Registered):
+            self._records(self.peer(shard), answer.aspects)
+            return True
         return False
 
     def _welcomed(self, shard: str, request: Hello, answer: Welcome) -> None:
@@ -199,15 +205,15 @@ class ClientSession(Generic[L]):
             self._enters(shard, answer.epoch, acknowledged=first and answer.open)
         elif request.known_epoch == answer.epoch:
             self._enters(shard, answer.epoch, acknowledged=True)
-        peer.recorded = frozenset(
-            [
-                name
-                for name, _, durability, *_ in answer.aspects
-                if durability != Durability.VOLATILE.value
-            ]
-        )
+        self._records(peer, answer.aspects)
         self.ttl_ns = min(self.ttl_ns, answer.ttl_ns)
         self.learn_placement(answer.placement)
+
+    @staticmethod
+    def _records(peer: Peer, aspects: Iterable[AspectEntry]) -> None:
+        """Note whose commits a shard records; a catalogue only grows in an epoch."""
+        volatile = Durability.VOLATILE.value
+        peer.recorded |= {entry.name for entry in aspects if entry.durability != volatile}
 
     def _epoch_changed(self, shard: str, epoch: int, *, asked_in: int | None) -> None:
         peer = self.peer(shard)

@@ -31,9 +31,8 @@ def name_of(multilock: MultiLock) -> str:
     lock, finishing = multilock.lock, multilock.finishing
     if finishing is None or not finishing.primary:
         return str(lock)
-    epoch = finishing.known_in(multilock.client.peer(finishing.primary).recorded)
     name = f"{lock.session}.{lock.lane}.{lock.seq}@{finishing.primary}"
-    return f"{name}~{epoch}" if epoch else name
+    return f"{name}~{finishing.known_in}" if finishing.known_in else name
 
 
 def read_name(name: str) -> tuple[LockId, str, int]:

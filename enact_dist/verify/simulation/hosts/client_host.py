@@ -246,9 +246,8 @@ class ClientNode(Host):
                     yield Sleep(50 * MS)
                     continue
                 self.learn(shard, answer, sent_in=epoch)
-                if isinstance(answer, Registered):
-                    registered = True
-                elif isinstance(answer, Refused):
+                registered = isinstance(answer, Registered)
+                if isinstance(answer, Refused):
                     self.world.violation("nothing is refused", answer)
                 else:
                     self.client.answered(shard, request, answer, self.local_ns)

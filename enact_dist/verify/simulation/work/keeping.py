@@ -123,8 +123,7 @@ class Keepers:
         (answer,) = yield ParallelCalls([(part.shard, Outcome(entry.id))])
         if isinstance(answer, OutcomeIs) and answer.kind == OUTCOME_UNSEEN:
             assert lock.finishing is not None
-            known_in = lock.finishing.known_in(host.client.peer(part.shard).recorded)
-            if known_in not in (0, answer.epoch):
+            if lock.finishing.known_in not in (0, answer.epoch):
                 self._world.tally["unknown commits that a restart took"] += 1
                 return
             self._world.tally["unknown commits that never came"] += 1
