@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Self, TypeVar
 from enact_dist.access.arguments import check_seconds
 from enact_dist.core.protocol.datum import Position, Slot
 from enact_dist.core.protocol.messages import Notice, Ping, Survey, Surveyed
-from enact_dist.core.state.clock import STAMP_NS_MAX, is_kept
+from enact_dist.core.state.clock import STAMP_NS_MAX, is_kept, is_older
 from enact_dist.errors import LinkError, ShardUnreachableError
 from enact_dist.link.notices import Interest, Skipped
 from enact_dist.terms import Durability, Entities, Entity
@@ -137,6 +137,11 @@ class _Following:
     behind: tuple[tuple[int, int], float] | None = None
 
 
+def _is_after(told: tuple[int, int], known: tuple[int, int]) -> bool:
+    """Whether a shard has sent more, by epoch and number, than is accounted for."""
+    return told > known or (told[0] > 0 and is_kept(told[0]) != is_kept(known[0]))
+
+
 class Watch(Following[Change]):
     """An iterator of `Change`; also a context manager.  One thread at a time may iterate.
 
@@ -229,7 +234,9 @@ class Watch(Following[Change]):
         if following is None:
             return
         same_epoch = notice.epoch == following.epoch
-        if notice.epoch < following.epoch or (same_epoch and notice.number <= following.number):
+        if same_epoch and notice.number <= following.number:
+            return
+        if is_older(notice.epoch, following.epoch):
             return
         no_stamps = any(not 0 < change.stamp_ns <= STAMP_NS_MAX for change in notice.changes)
         if not same_epoch or notice.number > following.number + 1 or no_stamps:
@@ -274,9 +281,10 @@ class Watch(Following[Change]):
         for shard, following in self._following.items():
             known = (following.epoch, following.number)
             behind = following.behind
-            if behind is None or behind[0] <= known:
+            if behind is None or not _is_after(behind[0], known):
                 told = self._client.notice_numbers.get(shard, (0, 0))
-                behind = following.behind = (told, time.monotonic()) if told > known else None
+                after = _is_after(told, known)
+                behind = following.behind = (told, time.monotonic()) if after else None
             if behind is None or time.monotonic() - behind[1] < self._feed.late_s:
                 continue
             missing = self._lenient and following.epoch < 0

@@ -201,14 +201,14 @@ class ShardBench:
                 self.keep_alive(session)
             self.event(Tick())
 
-    def restart(self, *, lose_pending: bool = True) -> None:
+    def restart(self, *, lose_pending: bool = True, epoch: int = 0) -> None:
         """Die and start again with what the disk has kept."""
         if not lose_pending:
             for persist in self.pending:
                 self.log += persist.records
         self.pending.clear()
         self.answers.clear()
-        self._boot(self.recovered(self.shard.epoch + 1))
+        self._boot(self.recovered(epoch or self.shard.epoch + 1))
 
     def recovered(self, epoch: int) -> Recovered:
         """Return what a store would give back."""

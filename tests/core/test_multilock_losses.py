@@ -169,6 +169,20 @@ class TestRestart:
         assert lock.phase is Phase.HELD
         assert bob.kinds_sent() == ["Hello", "Hello", "Hello", "Acquire"]
 
+    @pytest.mark.parametrize("epochs", [(1_700_000_000_000, 1_700_000_100), (9, 1_700_000_000_000)])
+    def test_shard_that_got_or_lost_its_folder_has_restarted(self, epochs):
+        """Its epochs count milliseconds without a folder and seconds with one: both are new."""
+        cell = CellBench("s0")
+        cell.shards["s0"].restart(epoch=epochs[0])
+        ann = cell.client("ann")
+        before = ann.locked(item(W))
+        cell.shards["s0"].restart(epoch=epochs[1])
+        ann.keep_alive()
+        after = ann.locked(item(W), lane=1, wait_s=20.0)
+
+        assert (before.phase, after.phase) == (Phase.LOST, Phase.HELD)
+        assert ann.core.epoch("s0") == epochs[1]
+
     def test_commit_that_never_arrived_is_lost(self, cell):
         """In the new epoch an unseen commit can never come true any more."""
         ann = cell.client("ann")

@@ -33,6 +33,30 @@ def test_idle_clients_with_a_long_ttl_let_a_restarted_shard_grant_at_once(make_c
             assert lock[request] == 1
 
 
+def test_client_goes_on_when_a_shard_gets_a_folder_or_loses_it(make_cell):
+    """Locks and a watch, in a session that was open all the time."""
+    cell = make_cell(ttl_s=1.0)
+    kept = cell.file.read_text()
+    unkept = "\n".join(line for line in kept.splitlines() if not line.startswith("data_folder"))
+    cell.file.write_text(unkept)
+    cell.start_all()
+    with connect(cell.file) as joined:
+        online = joined.world("online")
+        request = Write(online, counter, COUNT)
+        with online.watch(counter, COUNT) as watch:
+            for number, text in enumerate((unkept, kept, unkept)):
+                if number:
+                    cell.kill()
+                    cell.file.write_text(text)
+                    cell.start()
+                with Lock(request, wait_s=30.0) as lock:
+                    lock[request] = number
+                while (change := watch.next(timeout_s=30.0)) is not None and change.null:
+                    pass
+                assert change is not None
+                assert change.position == lock.position
+
+
 @pytest.mark.timing
 def test_recovery_keeps_its_goals():
     """Restart, dead client, dead holder and doubt: each figure twice, soon after its goal at most."""

@@ -32,7 +32,7 @@ from enact_dist.core.protocol.messages import (
     Registered,
     Welcome,
 )
-from enact_dist.core.state.clock import STAMP_NS_MAX
+from enact_dist.core.state.clock import STAMP_NS_MAX, is_older
 from enact_dist.terms import Durability
 
 if TYPE_CHECKING:
@@ -195,7 +195,7 @@ class ClientSession(Generic[L]):
 
     def _welcomed(self, shard: str, request: Hello, answer: Welcome) -> None:
         peer = self.peer(shard)
-        if answer.epoch < peer.epoch:
+        if is_older(answer.epoch, peer.epoch):
             return  # an old answer
         if answer.epoch != peer.epoch:
             self._drop_grants(shard)
@@ -217,8 +217,8 @@ class ClientSession(Generic[L]):
 
     def _epoch_changed(self, shard: str, epoch: int, *, asked_in: int | None) -> None:
         peer = self.peer(shard)
-        late = asked_in is not None and asked_in < epoch == peer.epoch
-        if epoch < peer.epoch or late:
+        late = asked_in is not None and asked_in != epoch == peer.epoch
+        if is_older(epoch, peer.epoch) or late:
             return  # whatever was held before is dropped already
         self._drop_grants(shard)
         self._enters(shard, epoch, acknowledged=False)

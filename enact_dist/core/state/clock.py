@@ -65,6 +65,14 @@ def is_kept(epoch: int) -> bool:
     return epoch < UNKEPT_FROM
 
 
+def is_older(epoch: int, than: int) -> bool:
+    """Whether a shard has begun one epoch before another, which an answer that is late may name.
+
+    Epochs of the two kinds do not compare: a shard that got a folder begins with a smaller number.
+    """
+    return epoch < than and is_kept(epoch) == is_kept(than)
+
+
 def state_of(*, grants: bool, draining: bool) -> str:
     """Say in words whether a shard grants locks, and if not, why."""
     if grants:

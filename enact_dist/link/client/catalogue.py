@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.datum_types import newest, same_type, successions, type_conflict
 from enact_dist.core.protocol.messages import AspectEntry, Registered, Welcome, WorldEntry
+from enact_dist.core.state.clock import is_older
 from enact_dist.core.state.retention import covers
 from enact_dist.errors import ConfigError, LinkError
 
@@ -142,7 +143,8 @@ class KnownCatalogue:
         epoch = answer.epoch if isinstance(answer, Welcome) else sent_in
         known = self._epochs.get(shard, 0)
         changes = successions(answer.aspects)
-        if epoch < known or (epoch == known and changes < self._successions.get(shard, 0)):
+        fewer = epoch == known and changes < self._successions.get(shard, 0)
+        if fewer or is_older(epoch, known):
             return  # older than the known state
         self._successions[shard] = changes
         if isinstance(answer, Welcome):

@@ -20,6 +20,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.messages import Alive, Ping, Pong, Welcome
+from enact_dist.core.state.clock import is_older
 from enact_dist.errors import LinkError
 from enact_dist.link.carrier import check_usable
 from enact_dist.link.notices import NoticeQueue
@@ -220,7 +221,7 @@ class SocketCarrier:
         """
         shard, old, connection = welcome.shard, None, None
         with self._mutex:
-            if self._closed or welcome.epoch < self._epochs.get(shard, 0):
+            if self._closed or is_older(welcome.epoch, self._epochs.get(shard, 0)):
                 return
             self._epochs[shard] = welcome.epoch
             self._shards.add(shard)
