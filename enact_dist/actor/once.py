@@ -181,8 +181,9 @@ class Once:
 
         Raises:
             TakenError: Another process acts on it.
-            LockTimeoutError, LeaseLostError, ChangedError, CommitUnknownError, LinkError: It was
-                not taken, and `update` did not run.
+            LockTimeoutError, LeaseLostError, ChangedError, LinkError: It was not taken, and
+                `update` did not run.
+            CommitUnknownError: `update` did not run; the next attempt finds whether it was taken.
         """
         while True:
             lock = self._bound.once_lock(entity, wait_s=wait_s, stop=self._stop)

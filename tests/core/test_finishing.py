@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import pytest
 from shard_bench import datum, lock_id, slot
 
 from enact_dist.core.client.finishing import Finishing, tokens_of
-from enact_dist.core.client.plan import Part
+from enact_dist.core.client.plan import Part, Phase
 from enact_dist.core.protocol.datum import Token
 from enact_dist.core.protocol.messages import (
     Commit,
@@ -94,3 +95,27 @@ def test_where_something_is_only_expected_the_epoch_stands_for_a_grant():
     tokens = tokens_of(parts, {"a": 9, "d": 4})
 
     assert tokens == {"a": Token(1, 5), "d": Token(4, 0)}
+
+
+@pytest.mark.parametrize(
+    ("epoch", "recorded", "prepared", "known_in"),
+    [
+        (7, (), False, 7),
+        (7, ("other",), False, 7),
+        (7, ("count", "other"), False, 0),
+        (7, (), True, 0),
+        (1_700_000_000_000, ("count",), False, 1_700_000_000_000),
+        (1_700_000_000_000, ("count",), True, 1_700_000_000_000),
+    ],
+)
+def test_outcome_outlives_a_restart_if_the_shard_has_recorded_it(
+    epoch, recorded, prepared, known_in
+):
+    """As data that are not volatile, or as a decision; and only if the shard has a folder."""
+    end = Finishing(LOCK, {**TOKENS, "a": Token(epoch, 5)}, {"a": WRITE, "b": WRITE}, {})
+    end.recorded, end.sent = frozenset(recorded), True
+    if prepared:
+        end.prepared = {"b": Prepared(LOCK, 90, ())}
+    end.ends(Phase.UNKNOWN)
+
+    assert (end.known_in, end.writes) == (known_in, {})

@@ -240,6 +240,27 @@ class TestRestart:
 
         assert lock.phase is (Phase.LOST if configured == "os" else Phase.UNKNOWN)
 
+    def test_shard_that_lost_its_folder_knows_nothing_of_a_commit(self, cell):
+        """Its record went with the folder, so nobody can tell whether others have read the data."""
+        shard = cell.shards["s0"]
+        ann = cell.client("ann")
+        lock = ann.locked(item(W))
+
+        def lose(_shard: str, request: object) -> str:
+            if isinstance(request, Commit):
+                shard.ask(request)
+                shard.log.clear()
+                shard.restart(epoch=1_700_000_000_000)
+                for _ in range(2):
+                    ann.keep_alive()
+                return REQUEST
+            return NOTHING
+
+        ann.lose = lose
+        ann.finish(lock, (slot(), "1"))
+
+        assert lock.phase is Phase.UNKNOWN
+
     @pytest.mark.parametrize("durability", ["volatile", "os"])
     def test_aspect_registered_since_the_greeting_counts_as_what_it_is(self, cell, durability):
         """Whoever asks later about a commit without an answer learns that a restart did not take it."""

@@ -333,9 +333,12 @@ class LosesCommits:
         return self._inner.request(shard, message, timeout_s=timeout_s, **more)
 
 
-@pytest.mark.parametrize("durability", [Durability.VOLATILE, Durability.OS])
+@pytest.mark.parametrize(
+    ("durability", "folder"),
+    [(Durability.VOLATILE, "stays"), (Durability.OS, "stays"), (Durability.OS, "goes")],
+)
 def test_restarted_shard_says_of_a_commit_that_it_would_have_recorded_that_it_never_came(
-    make_cell, monkeypatch, durability
+    make_cell, monkeypatch, durability, folder
 ):
     """Also of an aspect that the client registered after it had greeted the shard."""
     monkeypatch.setattr(link_client, "FINISH_S", 0.5)
@@ -346,8 +349,13 @@ def test_restarted_shard_says_of_a_commit_that_it_would_have_recorded_that_it_ne
         with pytest.raises(CommitUnknownError, match="no answer") as caught, Lock(count) as lock:
             lock[count] = 1
         daemons.kill()
+        if folder == "goes":
+            lines = daemons.file.read_text().splitlines()
+            daemons.file.write_text("\n".join(x for x in lines if not x.startswith("data_folder")))
         daemons.start()
-        if durability is Durability.OS:
+        with Lock(count, wait_s=30.0):  # it has greeted the shard, which knows its session
+            pass
+        if (durability, folder) == (Durability.OS, "stays"):
             assert mine.outcome(caught.value.lock_id) is None
         else:
             with pytest.raises(CommitUnknownError, match="no longer knows"):

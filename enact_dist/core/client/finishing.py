@@ -157,7 +157,7 @@ class Finishing:
         if answer.kind == OUTCOME_EXPIRED:
             return Phase.UNKNOWN, "its shard has no record of this session any more"
         if not self.pending and answer.epoch != self.token.epoch:
-            if self.unanswered and self._known_in():
+            if self.unanswered and (self._known_in() or not is_kept(answer.epoch)):
                 return (
                     Phase.UNKNOWN,
                     f"{SHARD_RESTARTED}, which lost its record of the commit, if there was one",

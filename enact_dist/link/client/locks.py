@@ -34,6 +34,7 @@ from enact_dist.core.protocol.messages import (
 )
 from enact_dist.core.protocol.placement import shard_of
 from enact_dist.core.shard.on_lock import NEWER_TYPE
+from enact_dist.core.state.clock import is_kept
 from enact_dist.errors import CommitUnknownError, EnactError, MisuseError
 from enact_dist.link.client.calls import BYTES_PER_S_MIN, CALL_S, bytes_with, request_timeout_s
 from enact_dist.link.client.kept import WantedLock
@@ -377,7 +378,8 @@ class CellClient(SessionClient):
 
     def _check_open(self, lock: MultiLock) -> None:
         if self.forked or self.closed:
-            lock.release()
+            with self._mutex:
+                lock.release()
             self.check_usable()
 
     def _not_committed(self, lock: MultiLock, started_ns: int) -> EnactError:
@@ -400,8 +402,11 @@ class CellClient(SessionClient):
             kind = answer.kind if isinstance(answer, OutcomeIs) else ""
             if isinstance(answer, OutcomeIs) and kind == OUTCOME_COMMITTED:
                 return answer.position
-            forgot = isinstance(answer, OutcomeIs) and known_in not in (0, answer.epoch)
-            if kind == OUTCOME_UNSEEN and not forgot:
+            if (
+                isinstance(answer, OutcomeIs)
+                and kind == OUTCOME_UNSEEN
+                and (known_in == answer.epoch or (not known_in and is_kept(answer.epoch)))
+            ):
                 if isinstance(released, Refused):  # its session lives, so it may still be sent
                     raise error_of(released)
                 return None
