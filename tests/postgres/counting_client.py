@@ -22,7 +22,7 @@ def main():
         if line.strip() == "longest":
             pauses = [after - before for before, after in pairwise(client.done_s)]
             kinds = sorted({type(error).__name__ for error in client.errors})
-            print("longest", max(pauses), *kinds, flush=True)
+            print("longest", f"{max(pauses):.2f} s", *kinds, flush=True)
             continue
         wait_s = float(line.strip().removeprefix("next") or 60.0)
         print("next", client.next_update(wait_s), flush=True)

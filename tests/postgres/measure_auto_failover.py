@@ -139,10 +139,10 @@ def measure(site, options):
     longest = [client.expect("longest") for client in clients]
     for client in clients:
         client.tell("end")
-    counted = [client.expect("right") for client in clients]
+    unknown = sum(int(client.expect("right").split()[1]) for client in clients)
     print(
         f"{options.fault} primary's host, daemon {options.daemon} it, {options.times} times: no"
-        f" update for {' s, '.join(longest)}; counts right, unknown {', '.join(counted)};"
+        f" update for {', '.join(longest)}; counts right, {unknown} unknown;"
         f" load {load:.1f} to {os.getloadavg()[0]:.1f}",
         flush=True,
     )
