@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from enact_dist.cli.text import literals
 from enact_dist.errors import ConfigError, DatumTypeError, MisuseError
 from enact_dist.wire.fingerprint import fingerprint
+from enact_dist.wire.payload import check_datum
 
 TYPES = [
     int, float, bool, str, bytes, list, dict, np.ndarray, list[int], dict[str, float],
@@ -59,6 +60,12 @@ def test_literal_of_an_array_has_the_dtype_of_the_aspect():
     assert (found.dtype, found.shape) == (np.float32, (2, 2))
 
 
+def test_whole_number_that_no_float_holds_is_refused_like_any_value():
+    """It stays what it is, and the check of the datum names it."""
+    with pytest.raises(DatumTypeError, match="asked float, found int 1000"):
+        check_datum(literals.read("1" + "0" * 400, float), float)
+
+
 def test_null_means_nothing():
     """The literal null is the order to delete."""
     assert literals.read("null", int) is literals.NOTHING
@@ -72,6 +79,15 @@ def test_null_means_nothing():
         ('{"a": 1}', dict[int, int], DatumTypeError, "key 'a': asked int, found str"),
         ('["a"]', NDArray[np.float64], DatumTypeError, "asked an array"),
         ("[[1], [1, 2]]", np.ndarray, DatumTypeError, "asked an array"),
+        ("[1, 300]", NDArray[np.uint8], DatumTypeError, "array of uint8.*: 300 is no uint8"),
+        ("[1.5]", NDArray[np.int32], DatumTypeError, "1.5 is no int32"),
+        ("[1e300]", NDArray[np.float32], DatumTypeError, r"1e\+300 is no float32"),
+        ("[true]", NDArray[np.float64], DatumTypeError, "True is no float64"),
+        ('["1"]', NDArray[np.int64], DatumTypeError, "'1' is no int64"),
+        ("[null]", NDArray[np.float64], DatumTypeError, r"found \[None\]"),
+        ('{"a": 1}', NDArray[np.float64], DatumTypeError, "found {'a': 1}"),
+        ("1" * 5000, int, ConfigError, "1{60}… is no JSON literal"),
+        ("[" * 100_000, list, ConfigError, r"\[{60}… is no JSON literal"),
         ("@/nowhere.npy", np.ndarray, ConfigError, "cannot read /nowhere.npy"),
     ],
 )
@@ -91,6 +107,17 @@ def test_files_are_read_by_their_ending(tmp_path):
     assert literals.read(f"@{tmp_path}/b.json", list) == [1]
     assert literals.read(f"@{tmp_path}/c", str) == "hello"
     assert literals.read(f"@{tmp_path}/c", bytes) == b"hello"
+
+
+def test_file_that_is_no_array_is_named(tmp_path):
+    """An empty .npy, as a full disk leaves it, and an archive under that name are refused."""
+    (tmp_path / "empty.npy").touch()
+    with (tmp_path / "more.npy").open("wb") as file:
+        np.savez(file, a=np.eye(2))
+
+    for name, reason in (("empty", "No data left in file"), ("more", "is an archive")):
+        with pytest.raises(ConfigError, match=f"cannot read .*{name}.npy: .*{reason}"):
+            literals.read(f"@{tmp_path}/{name}.npy", np.ndarray)
 
 
 def test_pickled_array_is_refused(tmp_path):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from enact_dist.access.session import unknown_aspect
+from enact_dist.config.table import path_of
 from enact_dist.errors import ConfigError, DatumTypeError, MisuseError
 
 if TYPE_CHECKING:
@@ -24,7 +26,11 @@ if TYPE_CHECKING:
 NOTHING: Final = object()
 """What `read` returns for the literal ``null``: the datum is to be deleted."""
 
+SHOWN_MAX: Final = 60
+"""Characters of a wrong literal that its error repeats."""
 _ARRAY_OF: Final[Any] = NDArray
+_TAKEN_BY: Final = {"b": "b", "i": "iuf", "u": "iuf", "f": "iuf", "c": "iuf"}
+"""Kinds of numpy's dtypes, each with those kinds whose values it may have."""
 _PLAIN: Final[Mapping[str, Any]] = {
     "int": int,
     "float": float,
@@ -111,15 +117,16 @@ def read(text: str, datum_type: Any) -> Any:
         DatumTypeError: It cannot be a value of `datum_type`.
     """
     if text.startswith("@"):
-        return _read_file(Path(text[1:]).expanduser(), datum_type)
+        return _read_file(path_of(text[1:]), datum_type)
     return _fitted(_json(text, text), datum_type)
 
 
 def _json(text: str, shown: str) -> object:
     try:
         return json.loads(text)
-    except json.JSONDecodeError as error:
-        quoted = "" if re.search(r"[\"\[{]", text) else f"; a text needs quotes: '\"{text}\"'"
+    except (ValueError, RecursionError) as error:  # also a number of thousands of digits
+        shown = shown if len(shown) <= SHOWN_MAX else f"{shown[:SHOWN_MAX]}…"
+        quoted = "" if re.search(r"[\"\[{\d]", text) else f"; a text needs quotes: '\"{shown}\"'"
         raise ConfigError(f"{shown} is no JSON literal: {error}{quoted}") from error
 
 
@@ -127,11 +134,13 @@ def _read_file(path: Path, datum_type: Any) -> Any:
     try:
         if path.suffix == ".npy":
             array: object = np.load(path, allow_pickle=False)
+            if not isinstance(array, np.ndarray):
+                raise ValueError("it is an archive (.npz); extract one array and save that as .npy")
             return array
         if path.suffix == ".json":
             return _fitted(_json(path.read_text(encoding="utf-8"), str(path)), datum_type)
         return path.read_text(encoding="utf-8") if datum_type is str else path.read_bytes()
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, EOFError) as error:
         raise ConfigError(f"cannot read {path}: {error}") from error
 
 
@@ -144,7 +153,7 @@ def _fitted(value: object, datum_type: Any) -> Any:
     if value is None:
         return NOTHING
     origin, arguments = getattr(datum_type, "__origin__", None), _arguments(datum_type)
-    if datum_type is float and type(value) is int:
+    if datum_type is float and type(value) is int and abs(value) <= sys.float_info.max:
         return float(value)
     if datum_type is np.ndarray or origin is np.ndarray:
         return _array(value, datum_type)
@@ -171,13 +180,36 @@ def _key(key: str, key_type: Any) -> object:
 
 
 def _array(value: object, datum_type: Any) -> NDArray[Any]:
-    dtype = None
-    if datum_type is not np.ndarray:
-        dtype = np.dtype(_arguments(_arguments(datum_type)[1])[0])
+    """Return a JSON value as an array; where the type names a dtype, of that one."""
+    asked = "an array of numbers (of at most 64 bits)"
     try:
-        array = np.asarray(value, dtype=dtype)
-    except ValueError as error:
-        raise DatumTypeError(f"asked an array, found {str(value)[:60]}: {error}") from error
+        array = np.asarray(value)
+        if datum_type is not np.ndarray and array.dtype != object:
+            dtype = np.dtype(_arguments(_arguments(datum_type)[1])[0])
+            asked = f"an array of {dtype.name}"
+            array = _converted(array, dtype)
+    except (ValueError, OverflowError) as error:
+        raise DatumTypeError(f"asked {asked}, found {str(value)[:60]}: {error}") from error
     if array.dtype == object:
-        raise DatumTypeError(f"asked an array of numbers, found {str(value)[:60]}")
+        raise DatumTypeError(f"asked {asked}, found {str(value)[:60]}")
     return array
+
+
+def _converted(array: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return an array of JSON values with another dtype, unless that changes one of them.
+
+    Raises:
+        ValueError: It does: a text would become a number, 1.5 a 1, or 300 a 44.
+    """
+    taken = _TAKEN_BY.get(dtype.kind, "")
+    if not taken:
+        return array.astype(dtype)
+    if array.size and array.dtype.kind not in taken:
+        raise ValueError(f"{array.flat[0].item()!r} is no {dtype.name}")
+    with np.errstate(all="ignore"):  # what comes out is looked at instead
+        converted = array.astype(dtype)
+    is_rounded = dtype.kind in "fc"  # which may not make an infinity of it
+    changed = np.isfinite(converted) != np.isfinite(array) if is_rounded else converted != array
+    if changed.any():
+        raise ValueError(f"{array[changed].item(0)!r} is no {dtype.name}")
+    return converted
