@@ -10,7 +10,7 @@ import pytest
 
 from enact_dist.actor.actor import Actor
 from enact_dist.actor.running.load import attributes_of, load_actor, make_actor, shown_values
-from enact_dist.errors import ConfigError
+from enact_dist.errors import ConfigError, EnactError, MisuseError
 from enact_dist.terms import Aspect, Entity, World, Write
 
 if TYPE_CHECKING:
@@ -101,6 +101,40 @@ def test_load_names_what_is_wrong_when_an_actor_cannot_be_made(
     """Each mistake is a `ConfigError` with the value and the remedy."""
     with pytest.raises(ConfigError, match=message):
         load_actor(target, options)
+
+
+def test_whole_number_of_a_toml_file_keeps_all_its_digits():
+    """A serial number of 16 digits lies beyond what a float holds exactly."""
+    serial = 2**53 + 1
+
+    actor = make_actor(Camera, {"folder": "a", "count": serial, "seed": 1e3})
+
+    assert isinstance(actor, Camera)
+    assert (actor.options[1], actor.options[5]) == (serial, 1000)
+    for wrong in (2.5, float("inf"), float("nan")):
+        with pytest.raises(ConfigError, match=r"count.*must be a whole number"):
+            make_actor(Camera, {"folder": "a", "count": wrong})
+
+
+@pytest.mark.parametrize(
+    ("raises", "kind", "message"),
+    [
+        (SystemExit(3), ConfigError, r"Failing.__init__ called sys.exit\(3\) at .*load.py:\d+"),
+        (ConnectionError("no camera"), MisuseError, r"ConnectionError at .*load.py:\d+: no camera"),
+        (TypeError("not so"), MisuseError, "Failing.__init__ failed: TypeError at .*: not so"),
+    ],
+)
+def test_init_that_fails_is_told_with_its_place(
+    raises: BaseException, kind: type[EnactError], message: str
+):
+    """It is the user's code, so the error says where; only wrong options are never tried again."""
+
+    class Failing(Camera):
+        def __init__(self) -> None:
+            raise raises
+
+    with pytest.raises(kind, match=message):
+        make_actor(Failing, {})
 
 
 def test_load_names_the_missing_library_when_a_module_needs_one(

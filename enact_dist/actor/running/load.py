@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.actor.actor import Actor, check_period, check_update
 from enact_dist.actor.report import ARGS_MAX
-from enact_dist.actor.running.doing import own_lines, place_of
-from enact_dist.config.table import suggestion
+from enact_dist.actor.running.doing import own_lines, place_of, raised
+from enact_dist.config.table import path_of, suggestion
 from enact_dist.errors import ConfigError, EnactError, MisuseError
 from enact_dist.terms import Entity
 
@@ -164,23 +164,27 @@ def make_actor(actor_class: type[Actor], options: Mapping[str, object]) -> Actor
 
     Raises:
         ConfigError: An unknown, missing or unreadable option, or `__init__` refused a value.
+        MisuseError: `__init__` raised something else; the message says where.
     """
     arguments = read_options(actor_class, options)
     changeable = attributes_of(actor_class)
-    at_start = inspect.signature(actor_class).parameters
+    at_start, name = inspect.signature(actor_class).parameters, actor_class.__name__
     try:
         chosen = actor_class.of_options(arguments)
         actor = chosen(**{key: arguments[key] for key in arguments if key in at_start})
         for key in arguments.keys() & changeable.keys() - at_start.keys():
             setattr(actor, key, arguments[key])
     except ValueError as error:
-        name = actor_class.__name__
         raise ConfigError(f"actor {name} refuses its options {dict(options)}: {error}") from error
     except SystemExit as error:
         raise ConfigError(
             f"{name}.__init__ called sys.exit({error.code!r}) at {place_of(error)}; it must return,"
             " or raise an exception"
         ) from error
+    except EnactError:
+        raise
+    except Exception as error:
+        raise MisuseError(f"{name}.__init__ failed: {raised(error)}") from error
     return actor
 
 
@@ -302,13 +306,20 @@ def _read(value: object, kind: object) -> Option:
     if kind is str or kind is Path:
         if not isinstance(value, str):
             return None
-        return value if kind is str else Path(value).expanduser()
+        return value if kind is str else path_of(value)
     if not isinstance(value, (int, float, str)):
         return None
     try:
-        number = int(value, 0) if kind is int and isinstance(value, str) else float(value)
-    except ValueError:
+        if kind is int:
+            return _whole(value)
+        number = float(value)
+    except (ValueError, OverflowError):
         return None
-    if not math.isfinite(number) or (kind is int and number != int(number)):
-        return None
-    return int(number) if kind is int else number
+    return number if math.isfinite(number) else None
+
+
+def _whole(value: float | str) -> int | None:
+    """Return a whole number, all its digits; 1e3 of a TOML file is one, too."""
+    if isinstance(value, str):
+        return int(value, 0)
+    return int(value) if value == int(value) else None
