@@ -15,6 +15,7 @@ exit  meaning
 from __future__ import annotations
 
 import argparse
+import io
 import os
 import re
 import sys
@@ -33,7 +34,7 @@ from enact_dist.cli.verbs import (
 from enact_dist.errors import EnactError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
 INTERRUPTED: Final = 130
 
@@ -76,6 +77,7 @@ class _Parser(argparse.ArgumentParser):
                 self._intermixes = False
         if left:
             # Behind an option that is not known, what it was to take is left over, too.
+            left = [word for word in left if word != "--"]
             unknown = [word for word in left if word.startswith("-")] or left
             self.error(f"unrecognized arguments: {' '.join(unknown)}")
         return found, left
@@ -118,6 +120,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Raises:
         SystemExit: The command line cannot be read (status 2), or `--help` was asked (0).
     """
+    _prepare_streams()
     try:
         return _main(list(sys.argv[1:] if argv is None else argv))
     except KeyboardInterrupt as error:  # while modules of ours are loaded, too
@@ -126,9 +129,22 @@ def main(argv: Sequence[str] | None = None) -> int:
         return INTERRUPTED
 
 
+def _prepare_streams() -> None:
+    """Open what the caller has closed, and let no character be an error of standard output.
+
+    Otherwise the next file or socket would become standard output, and errors go there.
+    """
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            stream = open(os.devnull, mode, encoding="utf-8")  # noqa: PTH123, SIM115 - it stays open
+            setattr(sys, name, stream)
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")
+
+
 def _main(words: list[str]) -> int:
-    words, command = _split_command(words)
     noun = next((word for word in words if not word.startswith("-")), "")
+    words, command = _split_command(words) if noun == "lock" and "hold" in words else (words, None)
     words, remarks = renamed(noun, words)
     for remark in remarks:
         print(f"enact: {remark}", file=sys.stderr)
@@ -136,11 +152,11 @@ def _main(words: list[str]) -> int:
     arguments = parser.parse_args(words)
     arguments.command = command
     if arguments.version:
-        return _version()
+        return _run(arguments, _version)
     if arguments.noun is None:
         parser.print_help()
         return USAGE
-    return _run(arguments)
+    return _run(arguments, _verb)
 
 
 def _split_command(words: list[str]) -> tuple[list[str], list[str] | None]:
@@ -151,7 +167,7 @@ def _split_command(words: list[str]) -> tuple[list[str], list[str] | None]:
     return words[:at], words[at + 1 :]
 
 
-def _version() -> int:
+def _version(_: argparse.Namespace) -> int:
     from importlib.metadata import PackageNotFoundError, version
 
     try:
@@ -161,12 +177,16 @@ def _version() -> int:
     return DONE
 
 
-def _run(arguments: argparse.Namespace) -> int:
+def _verb(arguments: argparse.Namespace) -> int:
     from enact_dist.operate.supervise import end_with_supervisor
 
+    end_with_supervisor()
+    return run_verb(arguments)
+
+
+def _run(arguments: argparse.Namespace, act: Callable[[argparse.Namespace], int]) -> int:
     try:
-        end_with_supervisor()
-        status = run_verb(arguments)
+        status = act(arguments)
         sys.stdout.flush()
     except EnactError as error:
         return _report(error, arguments)

@@ -9,6 +9,7 @@ prints for itself, an exit status.
 from __future__ import annotations
 
 import argparse
+import os
 from dataclasses import dataclass, field
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -324,4 +325,15 @@ def exit_status(error: Exception) -> int:
 
 def told(error: Exception) -> str:
     """Return what a command says of an error that has ended it: one line."""
-    return shown(" ".join((str(error) or type(error).__name__).split()))
+    text = str(error) or type(error).__name__
+    if isinstance(error, FileNotFoundError) and _folder_is_gone():
+        text = "the working folder was removed; enter one that is there (made anew: cd .)"
+    return shown(" ".join(text.split()))
+
+
+def _folder_is_gone() -> bool:
+    try:
+        os.getcwd()  # noqa: PTH109 - asked of the system
+    except FileNotFoundError:
+        return True
+    return False

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from enact_dist.config.rights import SecurityConfig
-from enact_dist.config.table import Field, fields_of, suggestion
+from enact_dist.config.table import Field, fields_of, path_of, suggestion
 from enact_dist.config.types import (
     CARRIER_DEFAULT,
     CellConfig,
@@ -148,7 +148,10 @@ def _read(name: str, text: str, field: Field) -> Any:
             raise ConfigError(f"{name}={text!r} is no number of seconds {allowed}")
         return seconds
     if kind is Path:
-        return Path(text).expanduser().absolute()
+        try:
+            return path_of(text).absolute()
+        except ConfigError as error:
+            raise ConfigError(f"{name}: {error}") from None
     if key.make is None:
         return text
     try:

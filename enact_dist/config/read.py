@@ -49,7 +49,7 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.config.environment import with_environment
 from enact_dist.config.lines import LineLocator
 from enact_dist.config.rights_check import check_clients, check_rights, refuse_unproven_names
-from enact_dist.config.table import ConfigSource, Table, suggestion
+from enact_dist.config.table import ConfigSource, Table, path_of, suggestion
 from enact_dist.config.types import (
     ActorProcess,
     CellConfig,
@@ -77,7 +77,7 @@ def load_config(
     Raises:
         ConfigError: The file is missing, is no TOML, or says something that cannot be used.
     """
-    file = Path(path).expanduser().absolute()
+    file = path_of(os.fspath(path)).absolute()
     try:
         text = file.read_text(encoding="utf-8-sig")  # some editors write a byte-order mark
     except OSError as error:
@@ -110,7 +110,7 @@ def parse_config(
     shown = shown or str(file)
     try:
         values = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # also a number of thousands of digits
         found = re.search(r"at line (\d+)", str(error))
         line = int(found[1]) if found else max(1, len(text.splitlines()))
         raise ConfigError(f"{shown}, line {line}: {error}", path=shown, line=line) from error

@@ -137,6 +137,21 @@ def suggestion(found: str, known: Iterable[str]) -> str:
     return f"; did you mean {close[0]!r}?" if close else ""
 
 
+def path_of(text: str) -> Path:
+    """Return the path that a text names, where `~` is a user's home.
+
+    Raises:
+        ConfigError: There is no such home: nothing may end in a folder that is called `~`.
+    """
+    try:
+        return Path(text).expanduser()
+    except RuntimeError:
+        raise ConfigError(
+            f"{text!r} begins with a home that is not known; write the whole path (~ needs HOME, or"
+            " an entry of the user in /etc/passwd)"
+        ) from None
+
+
 @dataclass(frozen=True, slots=True)
 class ConfigSource:
     """Where a configuration comes from.
@@ -276,7 +291,10 @@ class Table:
                 f"{suggestion(found, one.choices)} (known: {', '.join(one.choices)})",
             )
         if one.kind is Path:
-            return self.source.folder / Path(found).expanduser()
+            try:
+                return self.source.folder / path_of(found)
+            except ConfigError as error:
+                self.refuse(name, f"{name!r} in {self.title}: {error}")
         return one.kind(found) if one.choices else self._ready(name, one, found)
 
     def _number(self, name: str, one: Field) -> float:

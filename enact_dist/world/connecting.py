@@ -201,7 +201,7 @@ def _is_endpoint(target: str | Path) -> bool:
     if protocol == "unixsock-stream":
         return True
     if not host or not port.isdecimal() or not 0 < int(port) < 1 << 16:
-        raise ConfigError(f"endpoint {target!r} lacks a host or a port; {_ENDPOINT}")
+        raise ConfigError(f"{target!r} has no host, or no port from 1 to 65535; {_ENDPOINT}")
     return True
 
 

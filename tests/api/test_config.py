@@ -313,6 +313,9 @@ WRONG = {
     "period": ('name = "c"\n' + SHARD + '[actors.x]\nclass = "a:B"\nevery_s = 0\n', 6, "'every_s' in [actors.x] must lie between 0.001 and 86400, not 0"),
     "entity": ('name = "c"\n' + SHARD + '[actors.x]\nclass = "a:B"\nentity = "camera/*"\n', 6, "'camera/*' cannot name an entity"),
     "no toml": ('name = "c"\nworlds = [\n', 2, ""),
+    "no number": ('name = "c"\nlease_s = 1' + "0" * 5000 + "\n", 2, "Exceeds the limit (4300 digits)"),
+    "no depth": ('name = "c"\nworlds = ' + "[" * 5000, 2, "maximum recursion depth exceeded"),
+    "no home": ('name = "c"\ndata_folder = "~nobody-here/d"\n' + SHARD, 2, "'~nobody-here/d' begins with a home that is not known"),
     "twice": ('name = "c"\nname = "d"\n', 2, "Cannot overwrite a value"),
 }  # fmt: skip
 
@@ -424,6 +427,11 @@ WRONG_ENVIRONMENT = [
         "ENACT_SHARD_LEFT_LISTEN",
         "10.0.0.1:1",
         "ENACT_SHARD_LEFT_LISTEN: '10.0.0.1:1' is no endpoint",
+    ),
+    (
+        "ENACT_DATA_FOLDER",
+        "~nobody-here/d",
+        "ENACT_DATA_FOLDER: '~nobody-here/d' begins with a home",
     ),
     ("ENACT_SHARD_LEFT_LISTEN", "tcp/0.0.0.0:1", "set ENACT_SHARD_LEFT_ADVERTISE too"),
 ]

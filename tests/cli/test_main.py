@@ -1,6 +1,7 @@
 """`enact`: usage, exit statuses, one line per error, and what it does not import."""
 
 import argparse
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -191,6 +192,8 @@ def test_repeated_option_before_the_last_argument_counts_once():
         ("world tree online robot other", "enact world tree: error: unrecognized arguments: other"),
         ("world tree online --jsn robot", "enact world tree: error: unrecognized arguments: --jsn"),
         ("world --jsn tree online", "enact world: error: unrecognized arguments: --jsn"),
+        ("world tree online -- a b", "enact world tree: error: unrecognized arguments: b"),
+        ("shard ls -- left", "enact shard ls: error: unrecognized arguments: left"),
     ],
 )
 def test_what_is_left_over_is_named_by_its_verb(line, said, capsys):
@@ -199,6 +202,42 @@ def test_what_is_left_over_is_named_by_its_verb(line, said, capsys):
         main(line.split())
 
     assert capsys.readouterr().err.endswith(f"{said}\n")
+
+
+def test_two_dashes_end_the_options_of_all_but_a_held_command(enact):
+    """What follows them is an argument, whatever it begins with; nothing of it is left out."""
+    assert "no cell: there is no" in enact("world", "put", "online", "a/b", "--", "--5").err
+
+
+def shell(script, folder):
+    """Run a shell script in which `enact` is this version; return its status and all it printed."""
+    enact = f"{sys.executable} -m enact_dist.cli.main"
+    script = f'enact() {{ {enact} "$@"; }}\n{script}'
+    env = os.environ | {"PYTHONPATH": str(PAGES.parents[1]), "LC_ALL": "C.UTF-8"}
+    done = subprocess.run(
+        ["bash", "-c", script], cwd=folder, env=env, capture_output=True, text=True, check=False
+    )
+    return done.returncode, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize(
+    ("script", "status", "said"),
+    [
+        ("enact --version > /dev/full", 1, "enact: [Errno 28] No space left on device\n"),
+        ("enact --version | exec <&-; exit ${PIPESTATUS[0]}", 0, ""),
+        ("enact doctor --json >&-; test $? -lt 2", 0, ""),
+        ("enact world ls 2>&-", 2, ""),
+        ("mkdir a; cd a; rmdir ../a; enact world ls", 1, "enact: the working folder was removed"),
+        ("PYTHONIOENCODING=latin-1 enact lock hold --help", 0, "ASPECT:read|write \\u2026"),
+    ],
+)
+def test_output_that_cannot_be_written_is_no_traceback(script, status, said, tmp_path):
+    """A full disk, a reader that is gone, closed streams, a folder that is gone, another alphabet."""
+    found, text = shell(script, tmp_path)
+
+    assert said in text
+    assert bool(said) == bool(text)
+    assert (found, "Traceback" in text) == (status, False)
 
 
 def test_no_command_prints_help_and_is_usage(enact):

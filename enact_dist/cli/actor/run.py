@@ -17,7 +17,7 @@ from enact_dist.actor.running.group import ANEW, DRAIN_S, ActorGroup, Life
 from enact_dist.cli.arguments import pairs
 from enact_dist.cli.target import cell_config, cell_target, is_endpoint, open_cell, see_modules
 from enact_dist.cli.verbs import DONE, exit_status, told
-from enact_dist.config.table import suggestion
+from enact_dist.config.table import path_of, suggestion
 from enact_dist.config.types import ActorProcess, processes_of
 from enact_dist.errors import ConfigError, EnactError, MisuseError, UnknownWorldError
 from enact_dist.link.daemon.service_manager import ServiceManager
@@ -346,7 +346,7 @@ def cell_file(options: argparse.Namespace) -> Path | None:
         target = cell_target(options)
     except ConfigError:
         return None  # reported when the cell is opened
-    return None if is_endpoint(target) else Path(target).expanduser()
+    return None if is_endpoint(target) else path_of(target)
 
 
 def _listed(names: Iterable[str]) -> str:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import math
 import unicodedata
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from enact_dist.config.table import path_of
 from enact_dist.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -143,7 +143,7 @@ def save(datum: object, name: str) -> str:
     Raises:
         ConfigError: The ending is unknown, or the datum has nothing that the format can hold.
     """
-    path = Path(name).expanduser()
+    path = path_of(name)
     arrays: dict[str, Any] = {key or "datum": array for key, array in _arrays(datum, "")}
     if path.suffix == ".npz":
         if not arrays:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from enact_dist.cli.record import shows_of
 from enact_dist.cli.text.output import shown_bytes
 from enact_dist.cli.verbs import Output
+from enact_dist.config.table import path_of
 from enact_dist.errors import ConfigError, EnactError, ProtocolError
 from enact_dist.terms import checked_name
 
@@ -42,7 +43,7 @@ def export_world(cell: Cell, options: argparse.Namespace) -> Output:
         )
         facts = {"path": done.path, "data": done.versions, "size_bytes": done.size_bytes}
     else:
-        facts = _into_folder(world, Path(options.out).expanduser(), at_ns)
+        facts = _into_folder(world, path_of(options.out), at_ns)
     size = shown_bytes(int(str(facts["size_bytes"])))
     return Output(facts, f"{options.world}: {facts['data']} data, {size} in {facts['path']}")
 
