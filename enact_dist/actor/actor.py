@@ -19,7 +19,9 @@ pattern, because its own 4.2 meets new entities at run time.
 
 from __future__ import annotations
 
+import inspect
 import math
+import types
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Self
@@ -50,6 +52,14 @@ Declared = LockRequest[Any]
 """A lock request of an actor class, of whatever datum type."""
 
 _READING: Final = "Read, View, ReadEach or ViewEach"
+_METHODS: Final = {"update": ("self", "lock"), "start": ("self",), "stop": ("self",)}
+"""What a user writes, and what each is called with."""
+_NEVER_RUN: Final = (
+    (inspect.iscoroutinefunction, "an `async def`", "write asyncio.run(…)"),
+    (inspect.isasyncgenfunction, "an asynchronous generator", "write asyncio.run(…)"),
+    (inspect.isgeneratorfunction, "a generator, for it has a `yield`", "do all of it"),
+)
+"""Functions whose calls only make an object."""
 
 
 class Actor:
@@ -206,9 +216,10 @@ class Declaration:
         Raises:
             MisuseError: A request without a `World` role, two accesses to one datum, a trigger
                 that is not declared or not a reading request or written by the actor itself, both
-                `triggers` and `every_s`, a pattern that no triggering entity can match, an
-                `update` without any request, a `Together` that is not the only trigger, a
-                `once` that does not go with the triggers or has no request for its outcomes.
+                `triggers` and `every_s`, a pattern that no triggering entity can match, a method
+                that is `async`, a generator or takes other arguments, an `update` without any
+                request, a `Together` that is not the only trigger, a `once` that does not go with
+                the triggers or has no request for its outcomes.
         """
         requests = _requests_of(actor_class)
         together = _together_of(actor_class, requests)
@@ -225,6 +236,7 @@ class Declaration:
             per_entity=any(stands_for_trigger(request) for request in requests.values()),
         )
         if actor_class.update is not Actor.update:
+            _check_methods(actor_class)
             _check_schedule(actor_class, declaration)
             _check_accesses(declaration)
             _check_patterns(declaration)
@@ -411,6 +423,27 @@ def check_update(actor_class: type[Actor]) -> None:
             f"{actor_class.__qualname__} of {actor_class.__module__} is no actor that can run; make"
             " an instance of a subclass of Actor that defines update(self, lock)"
         )
+
+
+def _check_methods(actor_class: type[Actor]) -> None:
+    """Refuse a method that a call would not run, or that cannot be called as it will be."""
+    for name, words in _METHODS.items():
+        method = inspect.getattr_static(actor_class, name)
+        if not isinstance(method, types.FunctionType):
+            continue  # a static method or another callable: its own business
+        full = f"{actor_class.__name__}.{name}"
+        for is_kind, kind, remedy in _NEVER_RUN:
+            if is_kind(method):
+                raise MisuseError(
+                    f"{full} is {kind}: a call of it runs nothing of it; {remedy} inside"
+                    f" `def {name}({', '.join(words)})`"
+                )
+        try:
+            inspect.signature(method).bind(*words)
+        except TypeError as error:
+            raise MisuseError(
+                f"{full} cannot be called ({error}); write `def {name}({', '.join(words)})`"
+            ) from None
 
 
 def check_period(name: str, every_s: object) -> None:

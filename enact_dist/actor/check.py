@@ -66,6 +66,9 @@ if TYPE_CHECKING:
 STREAM_S: Final = 0.1
 """Data that are written this often, or more often, are a stream."""
 
+WRITERS_SHOWN_MAX: Final = 4
+"""Writers of one slot that an error shows with their requests."""
+
 Level = Literal["error", "warning", "advice"]
 
 
@@ -336,21 +339,32 @@ def _own_triggers(uses: Sequence[Use]) -> Iterator[ActorFinding]:
 
 
 def _writers(uses: Sequence[Use]) -> Iterator[ActorFinding]:
-    writes = [use for use in uses if use.request.access.writes]
+    """Find slots of several writers; eight copies of an actor are one mistake, not 28."""
+    # The slot that an unsaid one writes is not known.
+    writes = [use for use in uses if use.request.access.writes and not use.unsaid]
+    told: set[int] = set()
     for index, one in enumerate(writes):
-        for other in writes[index + 1 :]:
-            if one.actor is other.actor or not one.meets(other) or (one.shared and other.shared):
-                continue
-            if one.unsaid or other.unsaid:  # the slot that it writes is unknown
-                continue
-            yield ActorFinding(
-                "error",
-                "two writers",
-                (one.actor.name, other.actor.name),
-                f"{one} and {other} can write one slot, and the later one hides the other's datum;"
-                " give each its own, or list the request in `shared` of both classes if each"
-                " keeps what the other wrote",
-            )
+        later = range(index + 1, len(writes)) if index not in told else ()
+        rivals = {at: writes[at] for at in later if _are_rivals(one, writes[at])}
+        if not rivals:
+            continue
+        told |= {at for at, other in rivals.items() if other.named.address == one.named.address}
+        *first, last = [str(use) for use in (one, *rivals.values())][:WRITERS_SHOWN_MAX]
+        more = len(rivals) + 1 - WRITERS_SHOWN_MAX
+        first, last = ([*first, last], f"{more} more") if more > 0 else (first, last)
+        yield ActorFinding(
+            "error",
+            "two writers",
+            tuple(dict.fromkeys(use.actor.name for use in (one, *rivals.values()))),
+            f"{', '.join(first)} and {last} can write one slot, and the later one hides the other's"
+            " datum; give each its own, or list the request in `shared` of all their classes if"
+            " each keeps what the other wrote",
+        )
+
+
+def _are_rivals(one: Use, other: Use) -> bool:
+    both = one.shared and other.shared
+    return one.actor is not other.actor and not both and one.meets(other)
 
 
 def _unwritten(uses: Sequence[Use], initial: Collection[str]) -> Iterator[ActorFinding]:

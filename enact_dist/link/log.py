@@ -134,6 +134,8 @@ def say(formatter: logging.Formatter, event: str, text: str, **fields: object) -
     """
     if isinstance(formatter, JsonLines):
         text = formatter.line(event, text, level=logging.INFO, **fields)
+    else:
+        text = shown(text)  # it may end with the text of a user's error
     sys.stdout.write(f"{text}\n")
     sys.stdout.flush()
 

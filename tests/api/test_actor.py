@@ -30,6 +30,15 @@ FLAG = Write(online, SYSTEM, FLAGS)
 PAIR = Together([CLOUD, View(online, Entity("other"), SURFACE)], by="stamp")
 
 
+def runs_later(_self, _lock):
+    """Yield, so that a call of it does nothing yet."""
+    yield
+
+
+async def runs_never(_self, _lock=None):
+    """Be a coroutine, which somebody else would have to await."""
+
+
 def declared(**attributes: object) -> Declaration:
     """Make an actor class named `Sample` with these attributes and an update."""
     attributes.setdefault("update", lambda _self, _lock: None)
@@ -175,6 +184,32 @@ def test_declaration_covers_an_entity_only_when_every_pattern_without_each_match
             {"cloud": View(online, SYSTEM, SURFACE), "shared": [View(online, SYSTEM, SURFACE)]},
             r"Sample\.shared\[0\].*only a Write or WriteEach",
             id="shared read",
+        ),
+        pytest.param(
+            {"flags": FLAG, "every_s": 1.0, "update": runs_never},
+            r"Sample\.update is an `async def`.*write asyncio\.run",
+            id="async update",
+        ),
+        pytest.param(
+            {"flags": FLAG, "every_s": 1.0, "update": runs_later},
+            r"Sample\.update is a generator, for it has a `yield`: a call of it runs nothing",
+            id="generator",
+        ),
+        pytest.param(
+            {"flags": FLAG, "every_s": 1.0, "start": runs_never},
+            r"Sample\.start is an `async def`.*`def start\(self\)`",
+            id="async start",
+        ),
+        pytest.param(
+            {"flags": FLAG, "every_s": 1.0, "update": lambda _self: None},
+            r"Sample\.update cannot be called \(too many positional arguments\)"
+            r"; write `def update\(self, lock\)`",
+            id="update without lock",
+        ),
+        pytest.param(
+            {"flags": FLAG, "every_s": 1.0, "stop": lambda _self, _reason: None},
+            r"Sample\.stop cannot be called \(missing a required argument: '_reason'\)",
+            id="stop with an argument",
         ),
     ],
 )

@@ -91,6 +91,14 @@ def test_check_finds_two_writers_when_patterns_of_one_context_overlap():
     assert "alarm2.flags (Write online/system flags)" in found.text
 
 
+def test_check_tells_all_writers_of_one_slot_at_once():
+    """Actors that were copied are one mistake: six of them are no 15 errors."""
+    found = only(check(Camera, Reconstruction, *[Alarm] * 6))
+
+    assert found.actors == tuple(f"alarm{number}" for number in range(2, 8))
+    assert "alarm5.flags (Write online/system flags) and 2 more can write one slot" in found.text
+
+
 def test_check_accepts_two_writers_when_both_say_shared():
     """Writers that keep each other's datum are no finding; one alone that says so is one."""
     assert check(Camera, Reconstruction, PoliteAlarm, PoliteAlarm) == ()
