@@ -30,6 +30,22 @@ class HungStart(Hung):
         threading.Event().wait()
 
 
+class Spins(Hung):
+    every_s = 0.05
+
+    def start(self):
+        threading.Thread(target=threading.Event().wait, name="spins").start()
+
+    def update(self, lock):
+        lock[self.count] = 1
+
+
+class SpinsAndFails(Spins):
+    def start(self):
+        super().start()
+        raise OSError("no camera")
+
+
 class Leaver(Hung):
     every_s = 0.05
 
@@ -155,7 +171,7 @@ def test_drain_of_the_cell_file_is_taken(module, spawn, until, tmp_path, cell_fi
 def test_actor_that_calls_sys_exit_is_not_silent(module, spawn, until, cell_file):
     """In an update it is a failure with its place, and the actor goes on; in `start` its end."""
     actor = spawn("actor", "run", "hung:Leaver", "--cell", cell_file)
-    until(actor, "Leaver.update called sys.exit('no arm') at hung.py:26; raise an exception")
+    until(actor, "Leaver.update called sys.exit('no arm') at hung.py:42; raise an exception")
     actor.send_signal(signal.SIGTERM)
     rest = actor.stdout.read()
     start = spawn("actor", "run", "hung:LeaverAtStart", "--cell", cell_file)
@@ -163,7 +179,23 @@ def test_actor_that_calls_sys_exit_is_not_silent(module, spawn, until, cell_file
     assert actor.wait(60) == 0
     assert "stopped: actor Leaver after 0 updates" in rest
     assert start.wait(60) == 1
-    assert "LeaverAtStart.start called sys.exit(3) at hung.py:31" in start.stdout.read()
+    assert "LeaverAtStart.start called sys.exit(3) at hung.py:47" in start.stdout.read()
+
+
+@pytest.mark.parametrize(("target", "number"), [("Spins", signal.SIGTERM), ("SpinsAndFails", 0)])
+def test_thread_that_an_actor_has_started_does_not_keep_its_process(
+    target, number, module, spawn, until, cell_file
+):
+    """Nobody would start it again: for `enact up` and systemd it ran on, without its actor."""
+    actor = spawn("actor", "run", f"hung:{target}", "--cell", cell_file, "--drain", "0.2")
+    if number:
+        until(actor, "ready: actor")
+        actor.send_signal(number)
+    rest = actor.stdout.read()
+
+    assert actor.wait(60) == 1
+    assert ("start of actor SpinsAndFails failed" if not number else "stopped: actor") in rest
+    assert "did not end within 0.2 s of its actors, as threads of theirs still run: spins" in rest
 
 
 @pytest.mark.parametrize(("method", "does"), [("start", "stop"), ("stop", "start")])

@@ -26,10 +26,11 @@ import time
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.actor.running.doing import place_of_thread
 from enact_dist.operate.supervise import NEVER_AGAIN, RestartPauses
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from enact_dist.actor.running.doing import Doing
 
@@ -161,6 +162,46 @@ class Life:
     def _say(self, doing: Doing, why: str) -> None:
         log.critical("cut off: actor %s %s: %s", self._name, why, doing.cut_off())
         sys.stdout.flush()
+        sys.stderr.flush()
+
+
+class Leaving:
+    """Lets no thread that actors have started keep the process after their end.
+
+    The interpreter waits for all that are no daemon threads: forever for one that spins.  Threads
+    that ran before this was made do not count.
+
+    Args:
+        leave: Ends the process with a status; waits for no thread.
+    """
+
+    def __init__(self, *, leave: Callable[[int], object] = os._exit) -> None:
+        self._before, self._leave = set(threading.enumerate()), leave
+
+    def within(self, drain_s: float, status: int) -> None:
+        """End the process with a status where such threads still run in so many seconds."""
+        end_s = time.monotonic() + drain_s
+        new = [one for one in threading.enumerate() if one not in self._before and not one.daemon]
+
+        def wait() -> None:
+            for one in new:
+                one.join(max(0.0, end_s - time.monotonic()))
+            if left := [one for one in new if one.is_alive()]:
+                say = threading.Thread(target=self._say, args=(left, drain_s), daemon=True)
+                say.start()
+                say.join(SAY_S)
+                self._leave(status)
+
+        if new:
+            threading.Thread(target=wait, name="drain", daemon=True).start()
+
+    def _say(self, left: Sequence[threading.Thread], drain_s: float) -> None:
+        places = (f"{one.name} at {place_of_thread(one.ident or 0)}" for one in left)
+        log.critical(
+            "cut off: the process did not end within %g s of its actors, as threads of theirs still"
+            " run: %s; end them in `stop`, or make them daemon threads",
+            drain_s, ", ".join(places),
+        )  # fmt: skip
         sys.stderr.flush()
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from enact_dist.actor.running.commands import CommandListener
 from enact_dist.actor.running.doing import raised
-from enact_dist.actor.running.group import ANEW, DRAIN_S, ActorGroup, Life
+from enact_dist.actor.running.group import ANEW, CUT_OFF, DRAIN_S, ActorGroup, Leaving, Life
 from enact_dist.cli.arguments import pairs
 from enact_dist.cli.target import cell_config, cell_target, is_endpoint, open_cell, see_modules
 from enact_dist.cli.verbs import DONE, exit_status, told
@@ -53,8 +53,19 @@ class _Made:
 def run_actors(options: argparse.Namespace) -> int:
     """Run actors until they are done or a signal comes."""
     process = _process(options)
-    if process is not None and len(process.actors) > 1:
-        return _run_group(options, process)
+    drain_s = DRAIN_S if options.drain_s is None else float(options.drain_s)
+    leaving = Leaving()
+    try:
+        if process is not None and len(process.actors) > 1:
+            return _run_group(options, process, leaving)
+        return _run_one(options, process, leaving)
+    except Exception as error:
+        leaving.within(drain_s, exit_status(error))
+        raise
+
+
+def _run_one(options: argparse.Namespace, process: ActorProcess | None, leaving: Leaving) -> int:
+    """Run the actor of a process of its own."""
     manager = ServiceManager()
     target = process.members[0] if process is not None else options.targets[0]
     json_lines = JsonLines(process=f"actor {options.name or target}")
@@ -66,10 +77,13 @@ def run_actors(options: argparse.Namespace) -> int:
         for act in (lambda _: manager.stopping(), life.end):
             signals.call(act)
         signals.call_again(life.hurry)
-        return _lived(options, made, life, formatter)
+        status = _lived(options, made, life, formatter)
+    if status or signals.count:  # else it is done, and what it has started may go on
+        leaving.within(made.drain_s, status or CUT_OFF)
+    return status
 
 
-def _run_group(options: argparse.Namespace, process: ActorProcess) -> int:
+def _run_group(options: argparse.Namespace, process: ActorProcess, leaving: Leaving) -> int:
     """Run the actors of a process, each in a thread; see `actor.running.group`."""
     manager = ServiceManager()
     json_lines = JsonLines(process=f"process {process.name}", actors=process.members)
@@ -103,7 +117,10 @@ def _run_group(options: argparse.Namespace, process: ActorProcess) -> int:
         for act in (lambda _: manager.stopping(), group.end):
             signals.call(act)
         signals.call_again(group.hurry)
-        return group.run()
+        status = group.run()
+    if status or signals.count:
+        leaving.within(max(drains_s.values()), status or CUT_OFF)
+    return status
 
 
 def _lived(
