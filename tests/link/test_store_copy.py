@@ -123,6 +123,18 @@ def test_a_log_begun_anew_while_it_is_copied_is_copied_again(folder, tmp_path, m
     assert versions(tmp_path / "copy") == {"a": 1, "b": 1}
 
 
+def test_a_full_disk_of_a_backup_is_not_blamed_on_the_data(folder, tmp_path, monkeypatch):
+    """The error of a copy names both files, and first the one that could be read."""
+
+    def full(source, target, **_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(source), None, str(target))
+
+    monkeypatch.setattr(shutil, "copyfile", full)
+
+    with pytest.raises(StoreError, match=r"cannot be written to .*copy .*name another place"):
+        back_up(folder, tmp_path / "copy", cell="c", shard="left", unix_s=1)
+
+
 def test_a_shard_that_starts_during_a_restore_loses_nothing(folder, tmp_path, monkeypatch):
     """An empty folder may have data by the time that the backup is read."""
     back_up(folder, tmp_path / "copy", unix_s=100, **NAMES)

@@ -57,7 +57,7 @@ from enact_dist.link.offline.backup_files import (
     sealed,
     set_modes,
 )
-from enact_dist.link.store.medium import file_in, folder_errors, open_database
+from enact_dist.link.store.medium import FULL_ERRNOS, file_in, folder_errors, open_database
 from enact_dist.link.store.recovery import put_together, read_blobs
 from enact_dist.link.store.store import open_store, read_store
 
@@ -138,9 +138,15 @@ def back_up(folder: Path, into: Path, *, cell: str, shard: str, unix_s: int) -> 
 def _backup_error(folder: Path, into: Path, failure: OSError) -> StoreError:
     """Return the error that tells an operator about a system error during a backup."""
     remedy = "name another place with --to that has room and is writable for this user"
-    where = Path(str(getattr(failure, "filename", None) or into))
+    names = (failure.filename, failure.filename2)  # of a copy: from where, and to where
+    # Nothing is full where it is read, so a copy has failed where it is written.
+    at = names[failure.errno in FULL_ERRNOS and names[1] is not None]
+    where = Path(str(at or into))
     if (file := file_in(into.parent)) is not None:
         found = f"{file} is a file, not a folder: no backup can be written to {into}"
+    elif where.is_relative_to(folder) and failure.errno in FULL_ERRNOS:
+        found = f"the disk of the shard in {folder} has no room for links to its files ({failure})"
+        remedy = "free some there"
     elif where.is_relative_to(folder):
         found = f"the data of the shard in {folder} cannot be read ({failure})"
         remedy = "make the backup as the user that runs the shard"

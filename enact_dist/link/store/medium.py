@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 LOG_BYTES: Final = 8 << 20
 """Approximate size of the log at which it is carried into the database."""
 _ROW_LOG_BYTES: Final = 8 << 10
-_FULL_ERRNOS: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+FULL_ERRNOS: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 _DENIED_ERRNOS: Final = frozenset({errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR})
 _TRIAL_FILE: Final = "trial.db"
 _log = logging.getLogger("enact.store")
@@ -329,7 +329,7 @@ def _store_error(folder: Path, failure: OSError | sqlite3.Error) -> StoreError:
     path = str(getattr(failure, "filename", None) or folder)
     code = getattr(failure, "sqlite_errorcode", 0) & 0xFF
     number = failure.errno if isinstance(failure, OSError) else None
-    if number in _FULL_ERRNOS or code == sqlite3.SQLITE_FULL:
+    if number in FULL_ERRNOS or code == sqlite3.SQLITE_FULL:
         found = f"no room for the data of {folder}: {_free_bytes(folder)} bytes are free there"
         remedy = "free space on its disk, or raise its quota"
     elif number == errno.ENOMEM:
