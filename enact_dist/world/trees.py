@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 ALIKE_MIN: Final = 3
 """So many versions that differ in number or name alone share one line."""
+INDENT: Final = 4
+"""Columns of a terminal by which a branch is set off."""
 
 
 def on_terminal(out: IO[str] | None = None) -> bool:
@@ -85,13 +87,20 @@ def _rich_tree(root: Branch, out: IO[str]) -> None:
     from rich.text import Text
     from rich.tree import Tree
 
-    def grow(tree: Tree, branch: Branch) -> None:
+    needed = 0
+
+    def grow(tree: Tree, branch: Branch, indent: int) -> None:
+        nonlocal needed
         for child in branch.children.values():
-            grow(tree.add(Text(shown(child.label))), child)
+            label = shown(child.label)
+            needed = max(needed, indent + max(map(len, label.split()), default=0))
+            grow(tree.add(Text(label)), child, indent + INDENT)
 
     tree = Tree(Text(shown(root.label), style="bold"))
-    grow(tree, root)
-    Console(file=out).print(tree)
+    grow(tree, root, INDENT)
+    console = Console(file=out)
+    # Where a word does not fit, the terminal breaks the line: rich would break, or drop, the word.
+    Console(file=out, width=max(console.width, needed)).print(tree)
 
 
 # ---------------------------------------------------------------- causes and effects

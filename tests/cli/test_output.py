@@ -70,6 +70,19 @@ def test_narrow_terminal_breaks_no_word(capsys, monkeypatch):
     assert "21:11:29.659" in shown
 
 
+def test_narrow_terminal_hides_no_leaf_of_a_tree(capsys, monkeypatch):
+    """Below its indent there was no room at all for it."""
+    monkeypatch.setattr(trees, "on_terminal", lambda _=None: True)
+    monkeypatch.setenv("COLUMNS", "10")
+    root = trees.Branch("online")
+    root.at(["tray", "package", "3"]).children[" count"] = trees.Branch("weight_of_parts_g  v12")
+    trees.print_tree(root)
+
+    shown = capsys.readouterr().out
+    assert "weight_of_parts_g" in shown
+    assert "v12" in shown
+
+
 HOSTILE = "a\nforged row\x1b[2J\u202e[bold]x[/]"
 
 

@@ -8,6 +8,7 @@ import signal
 import time
 from collections import Counter
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -145,13 +146,14 @@ def _on_processes(
     run: Callable[[int], Result], seeds: Iterator[int], jobs: int
 ) -> Iterator[tuple[Result, float]]:
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_ignore_interrupts)
+    pool = ProcessPoolExecutor(jobs, mp_context=context)
     under_way: set[Future[tuple[Result, float]]] = set()
     try:
         while True:
             # One more than there are processes, so that none waits for its next seed.
             for seed in itertools.islice(seeds, jobs + 1 - len(under_way)):
-                under_way.add(pool.submit(_run, run, seed))
+                with _interrupts_left_to_us():
+                    under_way.add(pool.submit(_run, run, seed))
             if not under_way:
                 return
             done, under_way = wait(under_way, return_when=FIRST_COMPLETED)
@@ -161,6 +163,14 @@ def _on_processes(
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _ignore_interrupts() -> None:
-    """Leave Ctrl-C to the process that started this one."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+@contextmanager
+def _interrupts_left_to_us() -> Iterator[None]:
+    """Let processes that begin here never see Ctrl-C, not even while they import their modules.
+
+    They inherit the mask; a signal that comes meanwhile comes after the block.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
