@@ -7,6 +7,7 @@ once.
 
 from __future__ import annotations
 
+import typing
 from dataclasses import dataclass, fields, is_dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -22,7 +23,7 @@ from enact_dist.wire.limits import (
     INTEGER_MAX,
     TREE_BYTES_MAX,
 )
-from enact_dist.wire.shapes import shape_of
+from enact_dist.wire.shapes import shape_of, text_of
 from enact_dist.wire.tree_reader import TreeReader, build, untyped
 from enact_dist.wire.tree_writer import (
     INT_MAX,
@@ -237,4 +238,6 @@ def decode_untyped(datum: Datum) -> object:
 
 
 def _name(datum_type: Any) -> str:
+    if typing.get_origin(datum_type) is np.ndarray:
+        return text_of(shape_of(datum_type))  # Python's own text of it has 80 characters
     return datum_type.__qualname__ if isinstance(datum_type, type) else str(datum_type)

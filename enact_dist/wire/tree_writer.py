@@ -149,7 +149,10 @@ class TreeWriter:
             raise MisfitError(f"an array of {value.ndim} dimensions; at most {DIMENSIONS_MAX}")
         dtype: np.dtype[Any] = value.dtype
         if shape.dtype is not None and dtype.newbyteorder("=") != shape.dtype:
-            raise MisfitError(f"asked {text_of(shape)}, found dtype {dtype}")
+            raise MisfitError(
+                f"asked {text_of(shape)}, found dtype {dtype}; where nothing that matters is lost,"
+                f" write array.astype({shape.dtype.name!r})"
+            )
         if value.size and not dtype.itemsize:
             raise MisfitError(f"{value.size} items of dtype {dtype}, which has no size")
         if value.nbytes > BODY_BYTES_MAX:  # before a copy of what only looks that large
