@@ -118,7 +118,7 @@ def test_past_before_anything_was_set_is_empty(at, made):
     [
         (("@get",), 2, "which datum? world at WORLD TIME get ENTITY/ASPECT"),
         (("@get", "arm"), 2, "which datum?"),
-        (("@get", "nobody/time_count"), 1, "never set"),
+        (("@get", "nobody/time_count"), 1, "was null (not set by then); enact world history"),
         (("4000000000",), 1, "in the future"),
     ],
 )

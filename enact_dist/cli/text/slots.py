@@ -99,13 +99,15 @@ def missing(
     entity, aspect = slot
     reason = reason or NullReason.NEVER_SET.value
     remedy = f"enact world tree {world.name} shows what there is"
+    told = f"is null ({reason})"
     if reason == NullReason.NEVER_SET.value:
+        if world.past:
+            told = "was null (not set by then)"
+            remedy = f"enact world history {world.name} {entity}/{aspect} lists what came later"
         remedy += suggestion(f"{entity}/{aspect}", _likely(world, entity, aspect))
     elif reason == NullReason.DELETED.value:
         remedy = f"enact why {world.name} {entity}/{aspect} says by whom"
-    return NullDatumError(
-        f"{world.name}:{entity}/{aspect} is null ({reason}); {remedy}", reason=reason
-    )
+    return NullDatumError(f"{world.name}:{entity}/{aspect} {told}; {remedy}", reason=reason)
 
 
 def _likely(world: WorldContext | PastContext, entity: str, aspect: str) -> list[str]:
