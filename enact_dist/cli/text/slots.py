@@ -103,7 +103,8 @@ def missing(
     if reason == NullReason.NEVER_SET.value:
         if world.past:
             told = "was null (not set by then)"
-            remedy = f"enact world history {world.name} {entity}/{aspect} lists what came later"
+            remedy = f"enact world history {world.name} {entity}/{aspect} lists what came later,"
+            remedy += " if anything"
         remedy += suggestion(f"{entity}/{aspect}", _likely(world, entity, aspect))
     elif reason == NullReason.DELETED.value:
         remedy = f"enact why {world.name} {entity}/{aspect} says by whom"
