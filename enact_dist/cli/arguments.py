@@ -141,11 +141,15 @@ def slot_name(text: str) -> tuple[str, str]:
     return entity, aspect
 
 
+VERSION_DIGITS_MAX: Final = 18
+"""A version has 63 bits."""
+
+
 def slot_version(text: str) -> tuple[str, str, int]:
     """Read ``ENTITY/ASPECT[@VERSION]``, version 0 if none is named; an `argparse` type."""
     name, at, number = text.partition("@")
     slot = slot_name(name)
-    if at and not (number.isdecimal() and int(number)):
+    if at and not (number.isdecimal() and len(number) <= VERSION_DIGITS_MAX and int(number)):
         raise argparse.ArgumentTypeError(f"{text!r} does not name a version as @12")
     return *slot, int(number or 0)
 

@@ -134,7 +134,14 @@ def test_readers_all_have_json():
 
 
 @pytest.mark.parametrize(
-    "words", [["shard"], ["nonsense"], ["world", "get", "online"], ["lock", "break", "x"]]
+    "words",
+    [
+        ["shard"],
+        ["nonsense"],
+        ["world", "get", "online"],
+        ["lock", "break", "x"],
+        ["why", "online", "a/b@99999999999999999999"],
+    ],
 )
 def test_usage_is_refused_with_status_2(words, capsys):
     """A command line that cannot be read ends with status 2 and says how to write it."""
