@@ -1,6 +1,9 @@
 """Units, tables and trees: plain into a pipe, drawn on a terminal."""
 
 import json
+import os
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import pytest
@@ -98,3 +101,14 @@ def test_table_and_tree_show_control_characters_escaped(capsys):
     told = capsys.readouterr().out
     assert json.loads(told) == {"actor": HOSTILE}
     assert "\u202e" not in told
+
+
+def test_json_is_valid_where_the_terminal_has_fewer_characters():
+    """A program that reads it gets each character back, whatever the locale."""
+    command = "from enact_dist.cli.text.output import print_json; print_json(['é 🤖'])"
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii:backslashreplace"}
+    run = subprocess.run(
+        [sys.executable, "-c", command], env=environment, capture_output=True, check=True
+    )
+
+    assert json.loads(run.stdout) == ["é 🤖"]

@@ -27,12 +27,18 @@ TOLD_EVERY_S: Final = 0.2
 
 def print_json(value: object) -> None:
     """Print a value as JSON; dataclasses as objects, what JSON does not have as text."""
-    print(shown_json(json.dumps(value, default=_plain, ensure_ascii=False, indent=2)))
+    print(_json(value, indent=2))
 
 
 def print_json_line(value: object) -> None:
     """Print a value as one line of JSON, at once."""
-    print(shown_json(json.dumps(value, default=_plain, ensure_ascii=False)), flush=True)
+    print(_json(value), flush=True)
+
+
+def _json(value: object, *, indent: int | None = None) -> str:
+    every = (getattr(sys.stdout, "encoding", None) or "").lower().startswith("utf")
+    text = json.dumps(value, default=_plain, ensure_ascii=not every, indent=indent)
+    return shown_json(text)
 
 
 def _plain(value: object) -> object:
