@@ -5,7 +5,7 @@ The message is one msgpack map, so that any language can read it:
 ===============  ====  ===========================================================================
 key              type  value
 ===============  ====  ===========================================================================
-``v``            int   format of this map, 1
+``v``            int   format of this map, 2
 ``world``        str   the slot: its world context,
 ``entity``       str   … entity
 ``aspect``       str   … and aspect
@@ -18,9 +18,15 @@ key              type  value
 ``host``         str   … on which host
 ``pid``          int   … in which process
 ``null``         str   why it is null, as `NullReason` names it; "" for a datum
+``kind``         str   how it was made: "commit" or "fork" ("" where that is not known),
+``held_ns``      int   how long its lock had been held then,
+``reads``        list  … and what that had read: world context, entity, aspect, version, stamp_ns
+``left_out``     int   how many further data it had read
 ``encoding``     bin   the datum as `docs/protocol.md` defines it: its encoding
 ``body``         bin   … and its body
 ===============  ====  ===========================================================================
+
+Format 1 lacks ``kind``, ``held_ns``, ``reads`` and ``left_out``; it is read, too.
 
 Rule to keep: what this version does not know is refused; a change of the map raises ``v``.
 """
@@ -34,13 +40,16 @@ from typing import TYPE_CHECKING, Any, Final
 import msgpack
 
 from enact_dist.core.protocol.datum import Datum, Slot
+from enact_dist.core.protocol.messages import CAUSE_COMMIT, CAUSE_FORK, READS_MAX, DatumRead
 from enact_dist.errors import ProtocolError
 from enact_dist.terms import NullReason
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-FORMAT: Final = 1
+FORMAT: Final = 2
+FORMATS: Final = (1, 2)
+"""Formats that are read."""
 
 _TYPES: Final = {
     "v": int,
@@ -59,6 +68,11 @@ _TYPES: Final = {
     "encoding": bytes,
     "body": bytes,
 }
+_CAUSE_TYPES: Final = {"kind": str, "held_ns": int, "reads": list, "left_out": int}
+"""Of a map of format 2 besides."""
+_READ_TYPES: Final = [str, str, str, int, int]
+READ_BYTES: Final = 128
+"""About what a read takes."""
 _BIN_32: Final = struct.Struct(">BI")
 _BIN_32_CODE: Final = 0xC6
 
@@ -78,6 +92,10 @@ class Recorded:
         actor: Who committed it, "" where that is not known.
         host: Where that one ran.
         pid: As which process.
+        kind: How it was made, "commit" or "fork"; "" where that is not known.
+        held_ns: How long its lock had been held when it committed.
+        reads: What the lock had read.
+        left_out: How many further data it had read.
     """
 
     slot: Slot
@@ -90,6 +108,10 @@ class Recorded:
     actor: str = ""
     host: str = ""
     pid: int = 0
+    kind: str = ""
+    held_ns: int = 0
+    reads: tuple[DatumRead, ...] = ()
+    left_out: int = 0
 
     @property
     def state(self) -> tuple[int, int]:
@@ -104,7 +126,8 @@ class Recorded:
     @property
     def size(self) -> int:
         """Return about how many bytes it takes."""
-        return 256 + (self.datum.size + len(self.datum.encoding) if self.datum else 0)
+        datum_bytes = self.datum.size + len(self.datum.encoding) if self.datum else 0
+        return 256 + READ_BYTES * len(self.reads) + datum_bytes
 
 
 def encode_recorded(recorded: Recorded) -> bytes:
@@ -124,6 +147,10 @@ def encode_recorded(recorded: Recorded) -> bytes:
         "host": recorded.host,
         "pid": recorded.pid,
         "null": recorded.null_reason,
+        "kind": recorded.kind,
+        "held_ns": recorded.held_ns,
+        "reads": [[*one.slot, one.version, one.stamp_ns] for one in recorded.reads],
+        "left_out": recorded.left_out,
         "encoding": datum.encoding if datum is not None else b"",
     }
     packer = msgpack.Packer(autoreset=False)
@@ -143,13 +170,16 @@ def decode_recorded(message: bytes) -> Recorded:
         ProtocolError: It is damaged, or of another format.
     """
     try:
-        found = msgpack.unpackb(message)
+        found = msgpack.unpackb(message, max_array_len=READS_MAX)
     except (ValueError, msgpack.UnpackException) as error:
         raise ProtocolError(f"a recorded version cannot be read: {error}") from error
     if not isinstance(found, dict) or type(found.get("v")) is not int:
         raise ProtocolError("a recorded version is a map with its format under 'v'; found none")
-    if found["v"] != FORMAT:
-        raise ProtocolError(f"a recorded version has format {found['v']}; this one reads {FORMAT}")
+    if found["v"] not in FORMATS:
+        raise ProtocolError(
+            f"a recorded version has format {found['v']}; this one reads"
+            f" {' and '.join(map(str, FORMATS))}"
+        )
     _check(found)
     datum = None
     if not found["null"]:
@@ -166,11 +196,15 @@ def decode_recorded(message: bytes) -> Recorded:
         found["actor"],
         found["host"],
         found["pid"],
+        found.get("kind", ""),
+        found.get("held_ns", 0),
+        tuple(DatumRead(Slot(*one[:3]), *one[3:]) for one in found.get("reads", ())),
+        found.get("left_out", 0),
     )
 
 
 def _check(found: Mapping[str, Any]) -> None:
-    for key, wanted in _TYPES.items():
+    for key, wanted in (_TYPES if found["v"] == 1 else _TYPES | _CAUSE_TYPES).items():
         if type(found.get(key)) is not wanted:
             raise ProtocolError(
                 f"a recorded version has {type(found.get(key)).__name__} under {key!r}, not"
@@ -178,3 +212,8 @@ def _check(found: Mapping[str, Any]) -> None:
             )
     if found["null"] and found["null"] not in NullReason.__members__:
         raise ProtocolError(f"a recorded version is null for the unknown reason {found['null']!r}")
+    if found.get("kind", "") not in ("", CAUSE_COMMIT, CAUSE_FORK):
+        raise ProtocolError(f"a recorded version was made by the unknown way {found['kind']!r}")
+    for one in found.get("reads", ()):
+        if not isinstance(one, list) or [type(each) for each in one] != _READ_TYPES:
+            raise ProtocolError("a recorded version names what it was made of in no known way")

@@ -28,7 +28,7 @@ from enact_dist.recording.chunks import (
     Chunk,
     DamagedChunkError,
 )
-from enact_dist.recording.exact import FORMAT, decode_recorded
+from enact_dist.recording.exact import FORMATS, decode_recorded
 from enact_dist.recording.file import BEGIN_RECORD, END_RECORD, EXACT_TOPIC
 from enact_dist.terms import checked_name
 
@@ -107,10 +107,10 @@ class Recording:
             pass
         if not self.facts:
             raise ConfigError(f"{self.path} is an MCAP file, but no recording made by enact record")
-        if self.facts.get("format") != str(FORMAT):
+        if self.facts.get("format") not in [str(each) for each in FORMATS]:
             raise ConfigError(
                 f"{self.path} is a recording of format {self.facts.get('format')!r}; this one"
-                f" reads {FORMAT}"
+                f" reads {' and '.join(map(str, FORMATS))}"
             )
 
     def commits(self) -> Iterator[RecordedCommit]:
@@ -140,8 +140,8 @@ class Recording:
         Raises:
             ProtocolError: One of them can be no name.
         """
-        context, entity, aspect = recorded.slot
-        self._check_names(context, aspect, entity)
+        for context, entity, aspect in (recorded.slot, *(one.slot for one in recorded.reads)):
+            self._check_names(context, aspect, entity)
         return recorded
 
     def _check_names(self, context: str, aspect: str, entity: str = "e") -> None:

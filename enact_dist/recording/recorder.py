@@ -486,4 +486,8 @@ def _recorded(wanted: Wanted, entry: VersionEntry | None, found: Retained, commi
         cause.actor if cause is not None else "",
         cause.host if cause is not None else "",
         cause.pid if cause is not None else 0,
+        cause.kind if cause is not None else "",
+        cause.held_ns if cause is not None else 0,
+        cause.reads if cause is not None else (),
+        cause.reads_left_out if cause is not None else 0,
     )

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from enact_dist.errors import ProtocolError
 from enact_dist.recording.reading import Recording
 from enact_dist.view.catalogue import ListedState, SlotCatalogue
+from enact_dist.view.causes import RecordedLineage
 from enact_dist.view.drawing.scene import ShownDatum, shown_of
 from enact_dist.view.feed import drawable
 from enact_dist.view.source import FoundData
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from enact_dist.recording.exact import Recorded
     from enact_dist.recording.reading import RecordedCommit
     from enact_dist.view.source import Histories
+    from enact_dist.world.lineage import CauseTree, EffectTree
 
 
 class RecordingSource:
@@ -47,6 +49,7 @@ class RecordingSource:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self._begin(Recording(path))
         self.name = self._recording.path.name
+        self._lineage = RecordedLineage(self._recording.path)
         self.catalogue = SlotCatalogue()
         stamps: set[int] = set()
         for commit in self._recording.commits():
@@ -108,6 +111,14 @@ class RecordingSource:
     def histories(self, slots: Sequence[Slot]) -> Histories:
         """Return every moment of the recording as if each of these slots had it."""
         return {slot: list(enumerate(self.timeline.stamps_ns, 1)) for slot in slots}
+
+    def tree_of(self, way: str, recorded: Recorded, depth: int) -> CauseTree | EffectTree:
+        """Return the causes (``why``) or the effects (``impact``) of a version.
+
+        Raises:
+            ProtocolError: The recording holds what this version cannot read.
+        """
+        return self._lineage.tree_of(way, recorded, depth)
 
 
 class RecordingFeed:

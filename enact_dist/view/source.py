@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
     from enact_dist.core.protocol.messages import VersionEntry
     from enact_dist.world.cell import Cell
+    from enact_dist.world.lineage import CauseTree, EffectTree
 
 T = TypeVar("T")
 
@@ -79,6 +80,9 @@ class DataSource(Protocol):
     def histories(self, slots: Sequence[Slot]) -> Histories:
         """Return which versions of these slots are known."""
 
+    def tree_of(self, way: str, recorded: Recorded, depth: int) -> CauseTree | EffectTree:
+        """Return the causes (``why``) or the effects (``impact``) of a version."""
+
 
 class CellSource:
     """A running cell.  Its session reads only; every view is one of the past, which waits for none.
@@ -98,6 +102,16 @@ class CellSource:
     def of_page(self) -> CellSource:
         """Return this one: all pages share it."""
         return self
+
+    def tree_of(self, way: str, recorded: Recorded, depth: int) -> CauseTree | EffectTree:
+        """Return the causes (``why``) or the effects (``impact``) of a version.
+
+        Raises:
+            ForgottenError: The version has left its retention.
+            ShardUnreachableError: A shard does not answer.
+        """
+        follow = self.cell.why if way == "why" else self.cell.impact
+        return follow(*recorded.slot, recorded.version, depth=depth)
 
     # ------------------------------------------------------------ shards
 

@@ -29,7 +29,7 @@ from enact_dist.errors import ForgottenError, MisuseError, NullDatumError
 from enact_dist.terms import Entity, NullReason
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from enact_dist.access.session import Session
     from enact_dist.core.protocol.messages import VersionEntry
@@ -42,10 +42,12 @@ if TYPE_CHECKING:
 FORGOTTEN: Final = "forgotten"
 UNKNOWN: Final = "unknown"
 NULL: Final = "null"
+UNRECORDED: Final = "unrecorded"
 _KIND: Final = {
     FORGOTTEN: "forgotten: it has left its retention",
     UNKNOWN: "its cause is not known",
     NULL: "null",
+    UNRECORDED: "not in the recording",
     "fork": "forked",
 }
 
@@ -67,7 +69,7 @@ class Made:
         kind: "commit" or "fork"; otherwise why its cause is not known: "forgotten" (the version
             has left its retention), "unknown" (the version is there, its cause is not) or "null"
             (a lock read the slot while there was no datum yet, or none any more because its
-            volatile shard had restarted).
+            volatile shard had restarted), or "unrecorded" (a recording does not have it).
         actor: Who committed it; the empty string if it has no name.
         host: Host of that client.
         pid: Process of that client.
@@ -109,7 +111,7 @@ class Made:
     @property
     def known(self) -> bool:
         """Whether the version is still there, so that it can be pinned."""
-        return self.kind not in {FORGOTTEN, NULL}
+        return self.kind not in {FORGOTTEN, NULL, UNRECORDED}
 
     @property
     def slot(self) -> Slot:
@@ -151,8 +153,7 @@ def tree_of(
     """Return the causes or the effects of a version; see `Cell.why` and `Cell.impact`."""
     search = Search(session.client)
     root = search.start(_slot_of(session, *named), version)
-    follow = search.causes if kind is CauseTree else search.effects
-    return _grown(kind, search, root, follow, depth)
+    return grown(kind, search, root, depth)
 
 
 def _slot_of(
@@ -174,25 +175,19 @@ def _slot_of(
     )
 
 
-def _grown(
-    kind: type[Tree],
-    search: Search,
-    root: DatumRead,
-    follow: Callable[[Sequence[DatumRead]], Mapping[DatumRead, Sequence[DatumRead]]],
-    depth: int | None,
-) -> Tree:
+def grown(kind: type[Tree], search: Search, root: DatumRead, depth: int | None) -> Tree:
     """Return the tree from `root` on, each version in full where it is nearest to it.
 
     Args:
         kind: Which tree.
-        search: What is known of each version.
+        search: What is known of each version; asked with one question to each shard per step.
         root: Where it begins.
-        follow: Returns what comes next of each of some versions, with one question to each shard.
         depth: How many steps to follow; None: `DEPTH_MAX`.
     """
     if depth is not None and not 0 <= depth <= DEPTH_MAX:
         raise MisuseError(f"depth is {depth!r}; it must lie in 0 to {DEPTH_MAX} steps")
     depth = DEPTH_MAX if depth is None else depth
+    follow = search.causes if kind is CauseTree else search.effects
     steps, parents = {root: 0}, dict[DatumRead, DatumRead]()
     follows: dict[DatumRead, Sequence[DatumRead]] = {}
     level = [root]
@@ -205,23 +200,29 @@ def _grown(
             if following not in steps:
                 steps[following], parents[following] = step, one
                 level.append(following)
-    grown: dict[DatumRead, Tree] = {}
+    found: dict[DatumRead, Tree] = {}
     for one in reversed(steps):
         if steps[one] == depth:
-            grown[one] = search.made(kind, one, unfollowed=len(follows[one]))
+            found[one] = search.made(kind, one, unfollowed=len(follows[one]))
             continue
         children = [
-            grown[following]
+            found[following]
             if parents.get(following) == one
             else search.made(kind, following, elsewhere=True)
             for following in follows[one]
         ]
-        grown[one] = search.made(kind, one, tuple(children))
-    return grown[root]
+        found[one] = search.made(kind, one, tuple(children))
+    return found[root]
 
 
 class Search:
-    """What the shards know of versions, asked for step by step."""
+    """What the shards know of versions, asked for step by step.
+
+    Attributes:
+        missing: Why a version is not there.
+    """
+
+    missing = FORGOTTEN
 
     def __init__(self, client: CellClient) -> None:
         self._client = client
@@ -268,7 +269,11 @@ class Search:
                 self._known[_read_of(entry)] = entry
         for one in level:
             self._left_out[one] = self._cause(one).reads_left_out
-        return {one: sorted(self._cause(one).reads, key=partial(_as_read, one)) for one in level}
+        return {one: in_order_read(one, self._cause(one).reads) for one in level}
+
+    def shard_of(self, slot: Slot) -> str:
+        """Return the shard that stores a slot."""
+        return self._client.shard_of(slot.entity)
 
     def _cause(self, one: DatumRead) -> Cause:
         entry = self._known.get(one)
@@ -286,7 +291,7 @@ class Search:
             for read in self._cause(made).reads:
                 if read in found:
                     found[read][made] = None
-        return {one: sorted(made, key=_as_made) for one, made in found.items()}
+        return {one: in_order_made(made) for one, made in found.items()}
 
     def _entries(self, answers: Iterable[Versions]) -> list[VersionEntry]:
         entries: list[VersionEntry] = []
@@ -307,13 +312,13 @@ class Search:
         """Return a version as a part of a tree."""
         slot, version, stamp_ns = one
         entry, cause = self._known.get(one), self._cause(one)
-        nothing = NULL if not version else FORGOTTEN if entry is None else UNKNOWN
+        nothing = NULL if not version else self.missing if entry is None else UNKNOWN
         return kind(
             world=slot.context,
             entity=Entity(slot.entity),
             aspect=slot.aspect,
             version=version,
-            position=Position(stamp_ns, self._client.shard_of(slot.entity)),
+            position=Position(stamp_ns, self.shard_of(slot)),
             age_s=max(0, self._now_ns - stamp_ns) / 1e9 if stamp_ns else 0.0,
             kind=cause.kind or nothing,
             actor=cause.actor,
@@ -331,6 +336,16 @@ class Search:
 
 def _read_of(entry: VersionEntry) -> DatumRead:
     return DatumRead(*entry.state[:3])
+
+
+def in_order_read(by: DatumRead, reads: Iterable[DatumRead]) -> list[DatumRead]:
+    """Return what a version was made of, in the order in which a tree shows it."""
+    return sorted(reads, key=partial(_as_read, by))
+
+
+def in_order_made(made: Iterable[DatumRead]) -> list[DatumRead]:
+    """Return what was made from a version, in the order in which a tree shows it."""
+    return sorted(made, key=_as_made)
 
 
 def _as_read(by: DatumRead, read: DatumRead) -> tuple[object, ...]:

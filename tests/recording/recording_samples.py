@@ -118,6 +118,10 @@ def same(one, other):
         "actor",
         "host",
         "pid",
+        "kind",
+        "held_ns",
+        "reads",
+        "left_out",
     )
     return all(getattr(one, name) == getattr(other, name) for name in names)
 

@@ -7,11 +7,13 @@ from hypothesis import strategies as st
 from recording_samples import data, recorded, same
 
 from enact_dist.core.protocol.datum import Slot
+from enact_dist.core.protocol.messages import DatumRead
 from enact_dist.errors import ProtocolError
 from enact_dist.recording.exact import Recorded, decode_recorded, encode_recorded
 
 names = st.text("abc/", min_size=1, max_size=9)
 stamps = st.integers(0, 2**63 - 1)
+reads = st.builds(DatumRead, st.builds(Slot, names, names, names), stamps, stamps)
 versions = st.builds(
     Recorded,
     slot=st.builds(Slot, names, names, names),
@@ -23,6 +25,10 @@ versions = st.builds(
     actor=st.text(max_size=20),
     host=names,
     pid=st.integers(0, 2**22),
+    kind=st.sampled_from(("", "commit", "fork")),
+    held_ns=stamps,
+    reads=st.lists(reads, max_size=3).map(tuple),
+    left_out=st.integers(0, 2**32),
 )
 
 
@@ -48,10 +54,15 @@ def test_message_is_plain_msgpack():
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"v": 2}, "format 2"),
+        ({"v": 3}, "format 3"),
         ({"version": "1"}, "'version'"),
         ({"body": None}, "'body'"),
         ({"null": "BORED"}, "BORED"),
+        ({"kind": "dream"}, "dream"),
+        ({"reads": [["online", "piece", "value", 1]]}, "made of"),
+        ({"reads": [["online", "piece", 3, 1, 1]]}, "made of"),
+        ({"reads": [["online", "piece", "value", 1, 1]] * 1025}, "1025"),
+        ({"left_out": None}, "'left_out'"),
     ],
 )
 def test_what_this_version_does_not_know_is_refused(change, said):
@@ -59,6 +70,17 @@ def test_what_this_version_does_not_know_is_refused(change, said):
     message = msgpack.unpackb(encode_recorded(recorded("piece", 1))) | change
     with pytest.raises(ProtocolError, match=said):
         decode_recorded(msgpack.packb(message))
+
+
+def test_a_version_of_the_first_format_comes_without_causes():
+    """Recordings of before stay readable."""
+    version = recorded("piece", 1)
+    message = msgpack.unpackb(encode_recorded(version)) | {"v": 1}
+    for key in ("kind", "held_ns", "reads", "left_out"):
+        del message[key]
+    found = decode_recorded(msgpack.packb(message))
+    assert same(found, version)
+    assert (found.kind, found.reads) == ("", ())
 
 
 @given(st.binary(max_size=60))

@@ -79,7 +79,7 @@ def test_public_library_reads_it(tmp_path):
     schema, message = messages["/online/piece/value"]
     assert json.loads(message.data)["value"] == 4
     assert json.loads(schema.data)["properties"]["value"] == {"type": "integer"}
-    assert (metadata["enact"]["format"], metadata["enact.end"]["versions"]) == ("1", "2")
+    assert (metadata["enact"]["format"], metadata["enact.end"]["versions"]) == ("2", "2")
     assert statistics.message_count == 4
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from enact_dist.config.shows import Shows
     from enact_dist.core.protocol.datum import Slot
     from enact_dist.view.drawing.scene import ShownDatum
-    from enact_dist.view.source import CellSource
+    from enact_dist.view.source import CellSource, DataSource
     from enact_dist.world.lineage import CauseTree, EffectTree, Made
 
 DEPTH: Final = 4
@@ -92,12 +92,10 @@ class Lineage:
         self.steps: dict[str, tuple[Slot, int]] = {}
         self._tree: CauseTree | EffectTree | None = None
 
-    def ask(self, source: CellSource, shown: ShownDatum, way: str) -> None:
+    def ask(self, source: DataSource, shown: ShownDatum, way: str) -> None:
         """Ask for the causes (``why``) or the effects (``impact``) of a version."""
-        recorded = shown.recorded
-        follow = source.cell.why if way == "why" else source.cell.impact
         try:
-            self._tree = follow(*recorded.slot, recorded.version, depth=DEPTH)
+            self._tree = source.tree_of(way, shown.recorded, DEPTH)
         except EnactError as error:
             self._tree, self.content, self.steps = None, markup.small(markup.text(error)), {}
             return

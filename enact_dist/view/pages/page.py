@@ -384,9 +384,9 @@ class Page:
         self.contents.comparing.against = against
 
     def _on_lineage(self, way: str) -> None:
-        shown, source = self._chosen(), self._viewer.cell
-        if shown is not None and source is not None:
-            self._lineage.ask(source, shown, way)
+        shown = self._chosen()
+        if shown is not None:
+            self._lineage.ask(self._viewer.source, shown, way)
             self._detail.show_tree(self._lineage.content, list(self._lineage.steps))
 
     def _on_lineage_step(self, step: str) -> None:
@@ -394,7 +394,8 @@ class Page:
             slot, at_ns = self._lineage.steps[step]
             self.contents.world, self._datum, self._path = slot.context, slot, ""
             self._list()
-            self._look_back(at_ns)
+            # What was there before a recording began is seen from its begin on.
+            self._look_back(max(at_ns, self._viewer.timeline.oldest_ns))
 
     def _on_pin(self, label: str) -> None:
         self._said = self._lineage.pin(label.strip(), self._viewer.pin)

@@ -182,12 +182,12 @@ class DatumPanel:
         self._value = Text(gui)
         files = gui.add_button_group("download", ("PNG", "PLY", *(("MCAP",) if cell else ())))
         files.on_click(lambda event: send("download", event.target.value))
-        if not cell:
-            return
         ways = gui.add_button_group("lineage", ("why", "impact"))
         ways.on_click(lambda event: send("lineage", event.target.value))
         self._tree = Text(gui)
         self._step = Choice(gui, "step", send, "lineage step")
+        if not cell:
+            return
         self._label = gui.add_text("label", "", hint="letters, digits, _ . - and slashes")
         gui.add_button("keep under this label").on_click(lambda _: send("pin", self._label.value))
 
