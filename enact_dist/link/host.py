@@ -57,7 +57,8 @@ from enact_dist.errors import StoreError
 from enact_dist.link.clock import Clock, SystemClock
 from enact_dist.link.host_figures import Stalls, figures_of, latencies_of
 from enact_dist.link.lease import AnswerGate
-from enact_dist.link.memory.payload_desk import PayloadDesk, half_of, names_payloads
+from enact_dist.link.memory.drafts import half_of, names_payloads
+from enact_dist.link.memory.payload_desk import PayloadDesk
 from enact_dist.link.memory.use_marks import mark_uses
 from enact_dist.link.signals import Uninterrupted
 
@@ -87,7 +88,7 @@ _log = logging.getLogger("enact.shard")
 
 
 class ShardHost:
-    """One shard with its mutex, its store thread and its timer.  Thread-safe.
+    """One shard with its mutex, store thread, timer and `payloads`.  Thread-safe.
 
     Args:
         shard: The shard; only the host calls it from now on.
@@ -114,7 +115,7 @@ class ShardHost:
         mark_uses(shard.state.tenures.kept, shared)
         self._clock: Clock = clock or SystemClock()
         self._on_failure = on_failure
-        self._payloads = PayloadDesk(
+        self.payloads = PayloadDesk(
             shared,
             half_of(shared) if shared is None or payload_bytes_max is None else payload_bytes_max,
             firm=payload_bytes_max is not None,
@@ -171,7 +172,7 @@ class ShardHost:
 
     def figures(self) -> dict[str, float]:
         """Return counters and current values, by name; see `link.host_figures`."""
-        parts = self._shard.state, self._payloads, self.silence
+        parts = self._shard.state, self.payloads, self.silence
         now_ns = self._clock.monotonic_ns()
         return figures_of(*parts, parked=len(self._replies), now_ns=now_ns)
 
@@ -208,13 +209,13 @@ class ShardHost:
                 reply(too_large)
                 return
             if names_payloads(commit) and self._refusal(commit, identity) is None:
-                message = self._payloads.with_bodies(commit)  # otherwise staged data stay
+                message = self.payloads.with_bodies(commit)  # otherwise staged data stay
         elif kind is Stage:
             self._stage(cast("Stage", message), reply, identity, subject)
             return
         elif kind is ListSessions:
             more = self.silence.rounded() if self.silence else {}
-            self._shard.counters.update(self._payloads.figures() | more)
+            self._shard.counters.update(self.payloads.figures() | more)
         with self._mutex:
             if self._ended:
                 return
@@ -245,7 +246,7 @@ class ShardHost:
         if answer is None and self.rights is not None:
             with self._mutex:
                 answer = self._shard.denied(message, identity, subject)
-        reply(answer or self._payloads.stage(message, identity))
+        reply(answer or self.payloads.stage(message, identity))
 
     def _refusal(self, message: Request, identity: str) -> Refused | EpochChanged | None:
         """Return why the shard will refuse a message because of its sender, else None."""
@@ -418,11 +419,11 @@ class ShardHost:
         """Submit arrived requests, then advance time; return when the next tick is due, in ns."""
         for drain in tuple(self._inboxes):
             drain()
-        if drafts := self._payloads.drafts():
+        if drafts := self.payloads.drafts():
             with self._mutex:
                 working = set(filter(self._shard.state.tenures.works, drafts.values()))
             sessions = self._shard.state.sessions.by_id
-            self._payloads.sweep(sessions.__contains__, working.__contains__)
+            self.payloads.sweep(sessions.__contains__, working.__contains__)
         writing = self._store_thread.writing_since_s if self._store_thread is not None else None
         self._stalls.look(writing, time.monotonic())
         with self._mutex:

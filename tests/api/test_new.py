@@ -373,7 +373,7 @@ def test_second_new_of_a_block_is_refused(online, size):
         assert lock[read][:4].tolist() == [2, 2, 1, 1]
 
     with Lock(write) as lock:
-        lock.new(write, (size,), np.uint8)[:] = 3
+        lock.new(write, (size + 1,), np.uint8)[:] = 3  # of another length: no file is made ahead
         del lock[write]
         lock.new(write, (5,), np.uint8)[:] = 4
         lock[write] = np.full(5, 5, np.uint8)

@@ -165,7 +165,7 @@ def test_large_data_of_the_shards_user_go_through_a_folder_of_a_group_without_a_
         assert "payload_fallbacks" not in writer.statistics()
         assert "maps_failed" not in reader.statistics()
 
-    assert shard.host._payloads.figures()["payloads_adopted"] == 1
+    assert shard.host.payloads.figures()["payloads_adopted"] == 1
     assert mode_of(shard._shared.path) == 0o2710
 
 
@@ -229,8 +229,8 @@ def test_users_of_a_cell_with_rights_get_copies(tmp_path, monkeypatch):
                 for name in ("open/arm", "secret/arm")
             ]
             with Lock(*writes) as lock:
-                for write in writes:
-                    lock[write] = np.full(100_000, 1)
+                for more, write in enumerate(writes):  # of two lengths: no file is made ahead
+                    lock[write] = np.full(100_000 + more, 1)
             assert "payload_fallbacks" not in ada.statistics()
             payloads = [one.name for one in (shard._shared.path / "files").glob("*-*")]
             files = [one for one in payloads if not one.startswith("uses-")]
@@ -294,4 +294,4 @@ def test_large_data_of_other_users_travel_over_the_socket(daemon, endpoint):
 
     assert told == [str(sum(range(SIZE))), "socket"]
     assert wrote == ["socket"]
-    assert shard.host._payloads.figures()["payloads_adopted"] == 2
+    assert shard.host.payloads.figures()["payloads_adopted"] == 2

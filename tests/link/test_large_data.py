@@ -248,7 +248,7 @@ def found(cell, entity):
 
 
 def drafts(far):
-    return far.shard.host._payloads.figures()["payload_drafts"]
+    return far.shard.host.payloads.figures()["payload_drafts"]
 
 
 def test_publication_goes_on_after_the_network_was_cut(far):
@@ -349,7 +349,7 @@ def test_shard_that_lost_what_was_staged_gets_the_bytes_once_more(far, size, aga
         def wait(self, into=None):
             answer = self._begun.wait(into)
             if files.setdefault(answer.file, len(files)) == 0:
-                far.shard.host._payloads.drop(answer.file)
+                far.shard.host.payloads.drop(answer.file)
             return answer
 
     cell._client.carrier.begin = lambda *a, **k: Dropping(begin(*a, **k))

@@ -29,7 +29,7 @@ def cell(make_settings, endpoint):
 
     def files():
         assert leftovers().wait(30)
-        return shard.host._payloads.figures()["payload_files"]
+        return shard.host.payloads.figures()["payload_files"]
 
     found.files, found.shard = files, shard
     yield found

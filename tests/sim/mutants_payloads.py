@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 def adopts_half_a_payload(patch: Patch) -> None:
     """A commit gets a payload of which slices are missing."""
-    patch(payload_desk._Draft, "whole", property(lambda _draft: True))
+    patch(payload_desk.Drafted, "whole", property(lambda _draft: True))
 
 
 def keeps_what_was_adopted(patch: Patch) -> None:

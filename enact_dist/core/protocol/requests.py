@@ -158,6 +158,10 @@ class Stage:
     The first one, at offset 0 and without a body, makes room for `total` bytes: on the same host
     the client then fills the shard's file itself.  If it cannot, slices follow, in order; they may
     be repeated.  A total of 0 discards the payload.  Answered by the shard's link, not its core.
+
+    `ahead` asks for so many further files of that length under the next numbers, and for another
+    one whenever a commit has named one of them.  Each appears when and if the shard has room: a
+    client opens it, and asks for what is not there.
     """
 
     session: str
@@ -165,6 +169,7 @@ class Stage:
     offset: int
     total: int
     body: Datum
+    ahead: int = 0
 
 
 @message

@@ -269,6 +269,10 @@ OF_A_SHARD: Final[dict[str, Figure]] = {
         "unfinished large data dropped to make room for a client below its share",
         "find the client that stages much and commits nothing: enact actor ls; or raise the limit",
     ),
+    "files_ahead_removed": Figure(
+        "files made ahead of large data and removed unused: their client paused or ended, or room"
+        " was short"
+    ),
     "drafts_swept": Figure("drafts removed because their client was gone or gave them up", _DYING),
 }
 

@@ -14,7 +14,7 @@ SERIES_MAX: Final = 512
 SERIES_BITS: Final = 60
 """Numbers below and above 1 << `SERIES_BITS` are two series."""
 FIRST_STAGED: Final = 1 << SERIES_BITS
-"""From here on a client numbers payloads sent in slices; files that it fills itself begin at 1."""
+"""From here on a client numbers payloads sent in slices; below, files that it fills itself."""
 
 
 class UsedNames:

@@ -10,17 +10,20 @@ without a name, so that the writer can be detached from it in the same way.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import logging
 import os
 import stat
 import threading
+import time
 import weakref
 from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.core.protocol.datum import Datum
 from enact_dist.core.protocol.messages import Refused, Stage, Staged
 from enact_dist.errors import EnactError
+from enact_dist.link.memory.ahead import NamesAhead
 from enact_dist.link.memory.maps import (
     Pages,
     anonymous_file,
@@ -120,9 +123,10 @@ def _cut_off(pages: Pages, descriptor: int) -> None:
 class _Shared:
     """The shared folder of one start of a shard, if this process sees it."""
 
-    __slots__ = ("epoch", "folder", "keeps", "name", "nonce", "page")
+    __slots__ = ("ahead", "epoch", "folder", "keeps", "name", "nonce", "page")
 
-    def __init__(self, welcome: Welcome) -> None:
+    def __init__(self, welcome: Welcome, ahead: NamesAhead) -> None:
+        self.ahead = ahead
         self.name, self.nonce, self.epoch = welcome.shared, welcome.shared_nonce, welcome.epoch
         self.folder: OpenedFolder | None = None
         self.page: ClientPage | None = None
@@ -153,7 +157,7 @@ class SharedPayloads:
         self._session = session
         self._call = call
         self._count = count
-        self._numbers = itertools.count(1)
+        self._rows: Final = itertools.count(1).__next__
         self._mutex = threading.Lock()
         self._shards: dict[str, _Shared] = {}
         self._mapped: weakref.WeakValueDictionary[tuple[str, int, str], Pages] = (
@@ -166,7 +170,7 @@ class SharedPayloads:
             known = self._shards.get(welcome.shard)
             if known is not None and (known.epoch, known.name) == (welcome.epoch, welcome.shared):
                 return
-            self._shards[welcome.shard] = shared = _Shared(welcome)
+            self._shards[welcome.shard] = shared = _Shared(welcome, NamesAhead(self._rows))
             if shared.name:
                 try:
                     shared.folder = open_shared(shared.name, shared.nonce)
@@ -240,8 +244,15 @@ class SharedPayloads:
         shared = self._folder(shard)
         if shared is None or size <= PAYLOAD_BYTES_MIN:
             return None
-        file = f"{self._session}-{next(self._numbers):x}"
-        answer = self._call(shard, Stage(self._session, file, 0, size, NOTHING))
+        with self._mutex:
+            number, ready = shared.ahead.take(size, time.monotonic())
+        file = f"{self._session}-{number:x}"
+        if ready:
+            with contextlib.suppress(OSError):  # not there: it is asked for
+                return Draft(shard, file, size, self._opened(shared, file, size, os.O_RDWR))
+        with self._mutex:
+            ahead = shared.ahead.asks(size)
+        answer = self._call(shard, Stage(self._session, file, 0, size, NOTHING, ahead))
         if isinstance(answer, Refused) and answer.code == NO_ROOM:
             raise error_of(answer)
         if (

@@ -9,6 +9,7 @@
 
 The desk works in front of the shard: the core sees bodies and never learns where they are stored.
 A payload lasts as long as its bytes are in use, a draft as long as its client.
+Files that a client will ask for are made ahead (`link.memory.ahead`); they are drafts, too.
 
 Rules that a change must keep:
 
@@ -23,16 +24,17 @@ Rules that a change must keep:
 from __future__ import annotations
 
 import logging
-import os
 import threading
 import weakref
-from collections import Counter
-from dataclasses import dataclass, field, replace
+from collections import Counter, deque
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from enact_dist.core.protocol.messages import Refused, Staged, WriteItem
 from enact_dist.link.clock import Clock, SystemClock
+from enact_dist.link.memory.ahead import BYTES_MAX, FILES_MAX, AheadOf
+from enact_dist.link.memory.drafts import DRAFT_BYTES_MAX, Drafted, names_payloads
 from enact_dist.link.memory.maps import Pages, PlainMemory, body_of, leftovers, plain_memory
 from enact_dist.link.memory.names import UsedNames
 from enact_dist.link.memory.payload_files import PayloadFiles
@@ -55,8 +57,6 @@ DRAFT_NS: Final = 30_000_000_000
 """A draft of a session without a lock is dropped after this time without a slice."""
 FULL_NS: Final = 100_000_000
 """After a payload did not fit, the desk frees no room for one as large during this time."""
-DRAFT_BYTES_MAX: Final = 2 << 30
-"""Bytes of drafts in plain memory that may wait for their commits."""
 SHARES: Final = 4
 """Each client always has a quarter of the room for drafts; more only while others need none."""
 ROOM_S: Final = 1.0
@@ -67,38 +67,6 @@ ROOM_TRIES: Final = 8
 """How often history is removed for a draft, more each time, while others take that room."""
 
 _log = logging.getLogger("enact.shard")
-
-
-@dataclass(slots=True)
-class _Draft:
-    """A payload that no commit has named yet."""
-
-    session: str
-    owner: str
-    size: int
-    memory: Pages | PlainMemory
-    shared: bool
-    touched_ns: int
-    have: int = 0
-    writing: int = 0
-    beyond: list[tuple[int, int]] = field(default_factory=list)
-
-    def add(self, begin: int, end: int) -> None:
-        """Note the arrival of a slice, perhaps repeated or ahead of an earlier one."""
-        self.beyond.append((begin, end))
-        self.beyond.sort()
-        while self.beyond and self.beyond[0][0] <= self.have:
-            self.have = max(self.have, self.beyond.pop(0)[1])
-
-    @property
-    def whole(self) -> bool:
-        """Whether all of it is here: from slices or, without any, from its client in the folder.
-
-        False while a slice is being written: nothing may change once a commit has it.
-        """
-        if self.writing:
-            return False
-        return self.have == self.size or (self.shared and not self.have and not self.beyond)
 
 
 class PayloadDesk:
@@ -136,8 +104,9 @@ class PayloadDesk:
         self._clock: Clock = clock or SystemClock()
         self._mutex = threading.RLock()  # reentrant: a destructor may run anywhere
         self._opening = tuple(threading.Lock() for _ in range(16))
-        self._drafts: dict[str, _Draft] = {}
+        self._drafts: dict[str, Drafted] = {}
         self._files = 0
+        self._wanted: deque[AheadOf] = deque()
         self._adopted: dict[str, weakref.ref[Pages | PlainMemory]] = {}
         self._over = UsedNames()
         self._bytes = self._gone = 0
@@ -164,7 +133,7 @@ class PayloadDesk:
                 return Staged(file, total, False)  # a late copy that no client waits for
         if not 0 < total <= BODY_BYTES_MAX:
             return Refused("protocol", f"a payload of {total} bytes; at most {BODY_BYTES_MAX}")
-        draft: _Draft | Refused | None = self._drafts.get(file)
+        draft: Drafted | Refused | None = self._drafts.get(file)
         if draft is None:
             # Slices of one draft may come from several threads.
             with self._opening[hash(file) % len(self._opening)]:
@@ -177,9 +146,76 @@ class PayloadDesk:
             return draft
         if draft.size != total:
             return Refused("protocol", f"payload {file} has {draft.size} bytes, not {total}")
+        if not draft.asked or message.ahead != draft.ahead:
+            draft.asked, draft.ahead = True, message.ahead if draft.shared else 0
+            self._want(file, draft)
         return self._take(file, draft, message.offset, message.body)
 
-    def _take(self, file: str, draft: _Draft, offset: int, slice_: Datum) -> Staged | Refused:
+    # ---------------------------------------------------------------- files ahead
+
+    @property
+    def wants_ahead(self) -> bool:
+        """Whether `make_ahead` has something to do."""
+        return bool(self._wanted)
+
+    def make_ahead(self) -> None:
+        """Make the files that are wanted ahead; to be called once answers have been sent."""
+        while self._wanted:
+            try:
+                wanted = self._wanted.popleft()
+            except IndexError:  # another thread was faster
+                return
+            names = wanted.names()
+            if sum(file in self._drafts for file in names) > wanted.behind // 2:
+                continue  # several at once disturb a client less than one after each commit
+            for file in names:
+                with self._opening[hash(file) % len(self._opening)]:
+                    if not self._made_ahead(file, wanted):
+                        break
+
+    def _want(self, file: str, draft: Drafted) -> None:
+        if draft.ahead:
+            self._wanted.append(AheadOf(file, draft.owner, draft.size, draft.ahead))
+
+    def _made_ahead(self, file: str, wanted: AheadOf) -> bool:
+        """Make one file unless its name is in use, or was; return False if there is no room."""
+        session, size = wanted.session, wanted.size
+        with self._mutex:
+            if file in self._drafts or file in self._over:
+                return True
+            mine = [draft.size for draft in self._drafts.values() if draft.session == session]
+            many = len(mine) > FILES_MAX or sum(mine) + size > BYTES_MAX
+            if self._disk is None or many or self._bytes + size > self._bytes_max // 2:
+                return False
+            self._bytes += size
+            self._files += 1
+        try:
+            memory = self._filed(self._disk, file, size)
+        except OSError:
+            return False  # a client that asks for it will hear why
+        now_ns = self._clock.monotonic_ns()
+        draft = Drafted(
+            session, wanted.owner, size, memory, True, now_ns, ahead=wanted.behind, asked=False
+        )
+        with self._mutex:
+            if file not in self._over:
+                self._drafts[file] = draft
+        return True
+
+    def _gave_back(self, total: int) -> bool:
+        """Remove files made ahead, and not asked for, for so many bytes; return if any were."""
+        with self._mutex:
+            missing, gone = self._bytes + total - self._bytes_max, 0
+            for file in [file for file, one in self._drafts.items() if not one.asked]:
+                if missing > 0:
+                    missing -= self._drafts.pop(file).size  # its client may ask for it yet
+                    gone += 1
+        if gone:
+            self._count("files_ahead_removed", gone)
+            leftovers().wait(ROOM_S)
+        return bool(gone)
+
+    def _take(self, file: str, draft: Drafted, offset: int, slice_: Datum) -> Staged | Refused:
         end = offset + slice_.size
         if not 0 <= offset <= end <= draft.size:
             return Refused(
@@ -205,10 +241,10 @@ class PayloadDesk:
             draft.add(offset, end)
             return self._staged(file, draft)
 
-    def _staged(self, file: str, draft: _Draft) -> Staged:
+    def _staged(self, file: str, draft: Drafted) -> Staged:
         return Staged(file, draft.have, draft.shared)
 
-    def _opened(self, session: str, owner: str, file: str, total: int) -> _Draft | Refused | None:
+    def _opened(self, session: str, owner: str, file: str, total: int) -> Drafted | Refused | None:
         """Return a new draft; None if its name has been used meanwhile."""
         small = total <= PAYLOAD_BYTES_MIN  # often many together, and read with the grant
         memory: Pages | None = None
@@ -231,7 +267,9 @@ class PayloadDesk:
         except OSError as error:
             self._count("payloads_refused")
             return Refused(NO_ROOM, f"no memory for a payload of {total} bytes: {error.strerror}")
-        draft = _Draft(session, owner, total, found, memory is not None, self._clock.monotonic_ns())
+        draft = Drafted(
+            session, owner, total, found, memory is not None, self._clock.monotonic_ns()
+        )
         with self._mutex:
             if file in self._over:
                 return None
@@ -240,7 +278,7 @@ class PayloadDesk:
 
     def _has_room(self, total: int) -> bool:
         """Count the bytes of a new file if they fit under the limit, removing history if needed."""
-        if self._reserved(total):
+        if self._reserved(total) or (self._gave_back(total) and self._reserved(total)):
             return True
         until_ns, least = self._full
         if self._clock.monotonic_ns() < until_ns and total >= least:
@@ -294,7 +332,8 @@ class PayloadDesk:
                     freed += size
                     given_up.append(file)
             for file in given_up:
-                self.drop(file)
+                if self._drafts.pop(file).asked:
+                    self._over.add(file)
         if not given_up:
             return False
         self._count("drafts_displaced", len(given_up))
@@ -319,13 +358,19 @@ class PayloadDesk:
     def _in_folder(self, disk: PayloadFiles, file: str, total: int) -> Pages | None:
         """Return the memory of a new file whose bytes are counted; None if that fails."""
         try:
-            return disk.make(file, total, partial(self._ended, file, disk, total))
+            return self._filed(disk, file, total)
         except OSError as error:
+            self._travels(str(error.strerror or error), disk.folder)
+            return None
+
+    def _filed(self, disk: PayloadFiles, file: str, total: int) -> Pages:
+        try:
+            return disk.make(file, total, partial(self._ended, file, disk, total))
+        except OSError:
             with self._mutex:
                 self._bytes -= total
                 self._files -= 1
-            self._travels(str(error.strerror or error), disk.folder)
-            return None
+            raise
 
     def _travels(self, why: str, folder: SharedFolder) -> None:
         """Count a payload outside the folder, and log it; a full folder is logged less often."""
@@ -385,6 +430,7 @@ class PayloadDesk:
             del self._drafts[file]
             self._adopted[file] = weakref.ref(draft.memory, partial(self._unadopted, file))
             self._over.add(file)
+        self._want(file, draft)
         if draft.shared and self._disk is not None and not self._disk.publish(file):
             return None
         self._count("payloads_adopted")
@@ -426,7 +472,9 @@ class PayloadDesk:
             ]
             gone = [self._drafts.pop(file) for file in over]
         if gone:
-            self._count("drafts_swept", len(gone))
+            unused = sum(not draft.asked for draft in gone)
+            self._count("files_ahead_removed", unused)
+            self._count("drafts_swept", len(gone) - unused)
 
     def drafts(self) -> dict[str, str]:
         """Return the session of each draft, by its name."""
@@ -449,19 +497,3 @@ class PayloadDesk:
     def _count(self, name: str, count: int = 1) -> None:
         with self._mutex:
             self.counters[name] = self.counters.get(name, 0) + count
-
-
-def names_payloads(message: Commit | Prepare) -> bool:
-    """Whether a commit or prepare names data that were staged before it."""
-    for _, datum in message.writes:  # noqa: SIM110 - a generator takes twice as long
-        if datum is not None and datum.file:
-            return True
-    return False
-
-
-def half_of(folder: SharedFolder | None) -> int:
-    """Return half of the folder's file system in bytes; without a folder, the limit of drafts."""
-    if folder is None:
-        return DRAFT_BYTES_MAX
-    system = os.fstatvfs(folder.descriptor)
-    return system.f_blocks * system.f_frsize // 2

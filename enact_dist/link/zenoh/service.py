@@ -139,7 +139,9 @@ class ZenohService:
         self._marked: threading.Event | None = None
         self._mark = self._left = 0
         self._remove_inbox = host.add_inbox(self.drain_inbox)
-        self._staged: queue.SimpleQueue[tuple[Stage, _Call, str] | None] = queue.SimpleQueue()
+        self._staged: queue.SimpleQueue[tuple[Stage, _Call, str] | tuple[()] | None] = (
+            queue.SimpleQueue()
+        )
         self._staged_mutex = threading.Lock()
         self._staged_bytes = 0
         self._threads = [
@@ -322,11 +324,13 @@ class ZenohService:
             self._staged.put((message, call, identity))
 
     def _stage(self) -> None:
-        """Store slices of large data, in a thread: making room for them takes time."""
+        """Store slices of large data, in a thread: making room, and files ahead, takes time."""
         while (staged := self._staged.get()) is not None:
-            self._submit(*staged)
-            with self._staged_mutex:
-                self._staged_bytes -= staged[0].body.size
+            if staged:
+                self._submit(*staged)
+                with self._staged_mutex:
+                    self._staged_bytes -= staged[0].body.size
+            self._host.payloads.make_ahead()
 
     def _submit(self, message: Request, call: _Call, identity: str) -> None:
         try:
@@ -335,6 +339,8 @@ class ZenohService:
         except Exception:  # noqa: BLE001 - these threads serve all clients
             _log.exception("a %s could not be handled", type(message).__name__)
             call.drop()
+        if self._host.payloads.wants_ahead:
+            self._staged.put(())
 
     def reply_key(self, query: zenoh.Query) -> zenoh.KeyExpr | str:
         """Return the answer's key: the query's own, unless that addressed every shard."""
