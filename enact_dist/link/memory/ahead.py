@@ -98,8 +98,8 @@ class NamesAhead:
         One is enough for a client that pauses between two payloads; for others it would be late.
         """
         row = self._rows.get(size)
-        if row is None:  # other threads have used many lengths meanwhile
+        # Making larger ones would take memory's bandwidth from the client that fills the last one.
+        if row is None or size * FILES_MAX > BYTES_MAX:
             return 0
-        more = {-1: 0, 0: 1}.get(row.asked, FILES_MAX)
-        row.asked = min(more, FILES_MAX, BYTES_MAX // size)
+        row.asked = {-1: 0, 0: 1}.get(row.asked, FILES_MAX)
         return row.asked
