@@ -140,11 +140,10 @@ class Finishing:
         kept = is_kept(epoch) and (self.prepared or not self.recorded.isdisjoint(aspects))
         return 0 if kept else epoch
 
-    def ends(self, phase: Phase) -> None:
-        """Forget the data, which may be large, while the program may keep the lock."""
-        if self.sent and phase is not Phase.COMMITTED:
+    def note_who_knows(self) -> None:
+        """Note in which epochs the outcome of a commit without an answer can be known."""
+        if self.sent:
             self.known_in = self._known_in()
-        self.writes = {}
 
     def not_committed(self, answer: OutcomeIs, cause: str) -> tuple[Phase | None, str]:
         """Return what an outcome that is no commit means, None if the lock goes on, and why.

@@ -369,10 +369,11 @@ class MultiLock:
             self.client.ended(self)
             return
         if self.finishing is not None:
-            self.finishing.ends(phase)
+            if phase is not Phase.COMMITTED:
+                self.finishing.note_who_knows()
+            self.finishing.writes = {}  # they may be large, and the program may keep the lock
         if phase not in (Phase.COMMITTED, Phase.UNKNOWN):
-            touched = [part.shard for part in self.parts]
-            touched += [shard for shard, _ in self.plan.views if shard not in touched]
+            touched = dict.fromkeys([*(part.shard for part in self.parts), *dict(self.plan.views)])
             self.farewells += [(shard, Release(self.lock)) for shard in touched]
         self.client.ended(self)
 
@@ -400,8 +401,7 @@ class MultiLock:
         """
         if self.phase is not Phase.HELD:
             return
-        self.give_up_ns = give_up_ns
-        self._free_calls = self._retry_at_ns = 0
+        self.give_up_ns, self._free_calls, self._retry_at_ns = give_up_ns, 0, 0
         expected = by_shard(expects, self.plan.placement) if expects else {}
         viewed = {shard: self._epoch_viewed(shard) for shard in expected} if expected else {}
         written = {shard: tuple(items) for shard, items in writes.items() if items}
