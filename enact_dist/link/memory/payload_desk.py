@@ -106,7 +106,7 @@ class PayloadDesk:
         self._opening = tuple(threading.Lock() for _ in range(16))
         self._drafts: dict[str, Drafted] = {}
         self._files = 0
-        self._wanted: deque[AheadOf] = deque()
+        self.wants_ahead: deque[AheadOf] = deque()  # what `make_ahead` has to do
         self._adopted: dict[str, weakref.ref[Pages | PlainMemory]] = {}
         self._over = UsedNames()
         self._bytes = self._gone = 0
@@ -153,16 +153,11 @@ class PayloadDesk:
 
     # ---------------------------------------------------------------- files ahead
 
-    @property
-    def wants_ahead(self) -> bool:
-        """Whether `make_ahead` has something to do."""
-        return bool(self._wanted)
-
     def make_ahead(self) -> None:
         """Make the files that are wanted ahead; to be called once answers have been sent."""
-        while self._wanted:
+        while self.wants_ahead:
             try:
-                wanted = self._wanted.popleft()
+                wanted = self.wants_ahead.popleft()
             except IndexError:  # another thread was faster
                 return
             names = wanted.names()
@@ -175,7 +170,7 @@ class PayloadDesk:
 
     def _want(self, file: str, draft: Drafted) -> None:
         if draft.ahead:
-            self._wanted.append(AheadOf(file, draft.owner, draft.size, draft.ahead))
+            self.wants_ahead.append(AheadOf(file, draft.owner, draft.size, draft.ahead))
 
     def _made_ahead(self, file: str, wanted: AheadOf) -> bool:
         """Make one file unless its name is in use, or was; return False if there is no room."""

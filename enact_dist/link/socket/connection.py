@@ -193,7 +193,8 @@ class SocketConnection:
                 self._send(answer)
             else:
                 self._send_late()
-            host.payloads.make_ahead()
+            if host.payloads.wants_ahead:
+                host.payloads.make_ahead()
 
     def _may_read(self, slot: Slot) -> bool:
         rights = self._service.host.rights
