@@ -238,7 +238,7 @@ WRONG = {
 def _without_want(adopt):
     def wrong(desk, file, size):
         found = adopt(desk, file, size)
-        desk._wanted.clear()
+        desk.wants_ahead.clear()
         return found
 
     return wrong
