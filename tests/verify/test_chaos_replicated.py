@@ -133,7 +133,7 @@ def test_way_opens_with_the_last_of_its_cuts():
 
 def test_store_that_cannot_be_used_is_named_without_its_password():
     pytest.importorskip("psycopg")
-    with pytest.raises(LinkError, match=r"postgresql://me@127\.0\.0\.1:9/x: ") as found:
+    with pytest.raises(LinkError, match=r"postgresql://me@127\.0\.0\.1:9/x ") as found:
         _forget("postgresql://me:secret@127.0.0.1:9/x", "chaos")
     assert "secret" not in str(found.value)
 
