@@ -387,8 +387,8 @@ class ReferenceSessions(ReferenceKeeping):
         elif life is not None and life.phase in ("prepared", "finishing", "aborting"):
             life.ask_ns = min(life.ask_ns, self.now_ns + 50 * MS)
         elif life is None and any(other.kept for other in self.of(m.lock.session)):
-            lane = self.lane_of(m.lock)
-            if lane is not None and lane.top < m.lock.seq:
+            lane = self.lane_for(m.lock)  # a view may be the first of its lane
+            if lane.top < m.lock.seq:
                 lane.top = m.lock.seq
                 self.ended[m.lock] = "given back"
         self.answer(handle, "released")
