@@ -18,8 +18,8 @@ the key of each request and token, and where a socket is opened; an aspect names
 own has succeeded; listings come in pages; whether a shard is there is asked by a ping, whose answer
 names the start of its daemon; a
 request that waits for a stamp names its session; 8: a session may keep a grant, whose token a later
-named; 9: a lock may wait for news before it enters the queue; 10: a payload may ask for files of
-the next ones."""
+commit names; 9: a lock may wait for news before it enters the queue; 10: a payload may ask for
+files of the next ones."""
 DATUM_VERSION: Final = 1
 """Version of the encoding of data; these are stored, so old versions stay readable."""
 

@@ -36,7 +36,7 @@ def runs_later(_self, _lock):
 
 
 async def runs_never(_self, _lock=None):
-    """Be a coroutine, which somebody else would have to await."""
+    """Be a coroutine, of which a call runs nothing."""
 
 
 def declared(**attributes: object) -> Declaration:

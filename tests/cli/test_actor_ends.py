@@ -186,7 +186,7 @@ def test_actor_that_calls_sys_exit_is_not_silent(module, spawn, until, cell_file
 def test_thread_that_an_actor_has_started_does_not_keep_its_process(
     target, number, module, spawn, until, cell_file
 ):
-    """Nobody would start it again: for `enact up` and systemd it ran on, without its actor."""
+    """`enact up` and systemd start a process again only once it has ended."""
     actor = spawn("actor", "run", f"hung:{target}", "--cell", cell_file, "--drain", "0.2")
     if number:
         until(actor, "ready: actor")

@@ -241,7 +241,7 @@ class TestRestart:
         assert lock.phase is (Phase.LOST if configured == "os" else Phase.UNKNOWN)
 
     def test_shard_that_lost_its_folder_knows_nothing_of_a_commit(self, cell):
-        """Its record went with the folder, so nobody can tell whether others have read the data."""
+        """Its record went with the folder: nothing says whether others have read the data."""
         shard = cell.shards["s0"]
         ann = cell.client("ann")
         lock = ann.locked(item(W))
@@ -263,7 +263,7 @@ class TestRestart:
 
     @pytest.mark.parametrize("durability", ["volatile", "os"])
     def test_aspect_registered_since_the_greeting_counts_as_what_it_is(self, cell, durability):
-        """Whoever asks later about a commit without an answer learns that a restart did not take it."""
+        """Whether a restart takes the record of its commit depends on how it was registered."""
         ann = cell.client("ann")
         ann.call("s0", Register("ann", (), (AspectEntry("late", "int", durability),)))
         lock = ann.locked(item(W, aspect="late"))
