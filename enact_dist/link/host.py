@@ -3,7 +3,7 @@
 ::
 
     transport ── submit(request, reply) ─┐
-    store thread ── persisted ───────────┤ mutex │── Shard.handle ── effects ──┐
+    who writes ──── persisted ───────────┤ mutex │── Shard.handle ── effects ──┐
     timer thread ── Tick ────────────────┘                                     │
               reply(answer)  ◄── Reply │ StoreThread ◄── Persist │ watchers ◄── Publish
                                        │ other shards ◄── Call, Compare
@@ -123,7 +123,7 @@ class ShardHost:
             biggest=self._biggest,
             clock=self._clock,
         )
-        self._mutex = threading.RLock()  # reentrant for `count` in reply callbacks only
+        self._mutex = threading.RLock()  # reentrant for `count` in reply callbacks, and in here
         self._uninterrupted = Uninterrupted()
         self._replies: dict[int, Callable[[Answer], None]] = {}
         self._handles = 0
@@ -134,23 +134,22 @@ class ShardHost:
         self._each_tick: tuple[Callable[[], None], ...] = ()
         self._failure: Exception | None = None
         self._ended = False
-        self._draining = self._stops_now = False
+        self._draining = self._stops_now = self._lent = False
         self._rests = threading.Event()
         self._wake = threading.Condition(threading.Lock())
         self._look_again = False
         self._store = store
+        self._store_thread: StoreThread | None = None
         if store is None:
             shard.keep_nothing()
-        self._store_thread = self._start_store(store) if store is not None else None
         self.silence = AnswerGate.of(store, self.count, self._fail)
         self._stalls = Stalls(self.name, self.count)
+        if store is not None:
+            from enact_dist.link.store.thread import StoreThread
+
+            self._store_thread = StoreThread(store, self._persisted, self._fail)
         self._timer = threading.Thread(target=self._keep_time, name="enact-timer", daemon=True)
         self._timer.start()
-
-    def _start_store(self, store: Store) -> StoreThread:
-        from enact_dist.link.store.thread import StoreThread
-
-        return StoreThread(store, self._persisted, self._fail)
 
     # ---------------------------------------------------------------- for transports
 
@@ -196,11 +195,13 @@ class ShardHost:
         reply: Callable[[Answer], None],
         identity: str = "",
         subject: str | None = None,
+        lends: bool = False,
     ) -> None:
         """Pass a request to the shard; `reply` is called once, now or later, from any thread.
 
         If the host ends first, `reply` is never called: no answer means *unknown*.  `identity` is
         the sender ("": this process), `subject` whose rights it uses (None: no name is proven).
+        Who `lends` its thread calls `write_here` next, if the answer is not there yet.
         """
         kind = type(message)
         if kind is Commit or kind is Prepare:
@@ -225,16 +226,19 @@ class ShardHost:
                 return
             self._handles += 1
             self._replies[self._handles] = reply
+            self._lent = lends
             self._handle(message, self._handles, identity, subject)
+            self._lent = False
             if self._handles in self._replies or kind is Hello:
                 self._look_at_clock_for(message)
 
+    def write_here(self) -> None:
+        """Write what the last `submit` has left to this thread; see `StoreThread`."""
+        if self._store_thread is not None:
+            self._store_thread.write_here()
+
     def _stage(
-        self,
-        message: Stage,
-        reply: Callable[[Answer], None],
-        identity: str,
-        subject: str | None,
+        self, message: Stage, reply: Callable[[Answer], None], identity: str, subject: str | None
     ) -> None:
         if self._ended:
             return
@@ -326,11 +330,7 @@ class ShardHost:
     # ---------------------------------------------------------------- messages in, effects out
 
     def _handle(
-        self,
-        message: Request | Event,
-        handle: int,
-        identity: str = "",
-        subject: str | None = None,
+        self, message: Request | Event, handle: int, identity: str = "", subject: str | None = None
     ) -> None:
         """Let the shard decide, and perform its effects.  The mutex is held."""
         if get_ident() == self._uninterrupted.main:
@@ -361,6 +361,9 @@ class ShardHost:
                     later.append(effect)
                 else:
                     self._perform(effect)
+            store = self._store_thread
+            if store is not None and store.queue and not (self._lent and handle in self._replies):
+                store.wake()
             for told in later:
                 self._tell(told)
             if self._draining and self._shard.idle:
@@ -368,7 +371,7 @@ class ShardHost:
         except BaseException as failure:
             # A half-made decision must not be used.
             _log.exception("the shard failed on %s", type(message).__name__)
-            self._end_failed(failure)
+            self._fail(failure)
             if not isinstance(failure, Exception):
                 raise
 
@@ -376,7 +379,7 @@ class ShardHost:
         """Perform an effect that concerns the store or another shard."""
         if isinstance(effect, Persist):
             if self._store_thread is not None:
-                self._store_thread.submit(effect)
+                self._store_thread.submit(effect, wake=False)
         elif isinstance(effect, Compare):
             self._compare(effect)
         elif self._call is not None:
@@ -395,23 +398,19 @@ class ShardHost:
         """Report to the shard that these tickets are stored."""
         with self._mutex:
             for ticket in tickets:
-                if ticket and not self._failure:
-                    self._handle(Persisted(ticket), 0)
+                self.event(Persisted(ticket))
 
-    def _fail(self, failure: Exception) -> None:
+    def _fail(self, reason: BaseException) -> None:
         with self._mutex:
-            self._end_failed(failure)
-
-    def _end_failed(self, reason: BaseException) -> None:
-        if self._failure is not None:
-            return
-        failure = reason if isinstance(reason, Exception) else RuntimeError(repr(reason))
-        self._failure, self._ended = failure, True
-        self._replies.clear()
-        self._rests.set()
-        _log.critical("shard %s stops: %s", self.name, failure)
-        if self._on_failure is not None:
-            self._on_failure(failure)
+            if self._failure is not None:
+                return
+            failure = reason if isinstance(reason, Exception) else RuntimeError(repr(reason))
+            self._failure, self._ended = failure, True
+            self._replies.clear()
+            self._rests.set()
+            _log.critical("shard %s stops: %s", self.name, failure)
+            if self._on_failure is not None:
+                self._on_failure(failure)
 
     # ---------------------------------------------------------------- time
 

@@ -41,10 +41,12 @@ class FakeStore:
     """A store whose disk the test holds: writes wait for `may_write`, or fail."""
 
     holding = None
+    tired = False
 
     def __init__(self, failure=None):
         self.may_write = threading.Event()
         self.batches = []
+        self.written = threading.Semaphore(0)
         self.failure = failure
         self.closed = False
 
@@ -53,6 +55,7 @@ class FakeStore:
         if self.failure is not None:
             raise self.failure
         self.batches.append(list(batch))
+        self.written.release()
 
     def rest(self):
         pass
@@ -189,6 +192,40 @@ def test_host_acknowledges_a_durable_commit_only_after_the_store(start, make_pee
     assert not early
     assert answered.wait(30)
     assert isinstance(answers[0], Committed)
+
+
+@pytest.mark.parametrize("answered", [True, False], ids=["answered", "parked"])
+def test_a_lent_thread_leaves_nothing_in_the_queue(start, make_peer, monkeypatch, answered):
+    """Records of a request that is answered at once are stored without the thread's help."""
+    monkeypatch.setattr(ShardHost, "_tick_on", lambda _: None)  # the next tick would see them
+    store = FakeStore()
+    store.may_write.set()
+    host = start(store, durability="durable")
+    peer = make_peer(call_of(host), durability="durable")
+    peer.hello()
+    granted = peer.acquire("cup")
+    peer.commit(granted, "cup", b"x")
+    granted = peer.acquire("cup")
+    while store.written.acquire(blocking=False):
+        pass  # what was stored so far
+    sent, answers = [], []
+    peer.call = lambda _, message: sent.append(message)
+    if answered:
+        peer.goodbye()
+    else:
+        peer.commit(granted, "cup", b"y")
+
+    def lend():
+        host.submit(sent[0], answers.append, lends=True)
+        if not answers:
+            host.write_here()
+
+    lender = threading.Thread(target=lend)
+    lender.start()
+    lender.join(30)
+
+    assert len(answers) == 1
+    assert store.written.acquire(timeout=30)
 
 
 def test_host_acknowledges_nothing_when_the_store_fails(start, make_peer):

@@ -65,9 +65,9 @@ def submitted(monkeypatch):
     found = []
     real = ShardHost.submit
 
-    def submit(host, message, reply, identity="", subject=None):
+    def submit(host, message, reply, identity="", subject=None, lends=False):
         found.append((type(message), identity, subject))
-        real(host, message, reply, identity, subject)
+        real(host, message, reply, identity, subject, lends)
 
     monkeypatch.setattr(ShardHost, "submit", submit)
     return found

@@ -27,7 +27,7 @@ class Holding:
         self.failed = None
         self.copies = 1
         self.waits_s = 0.0
-        self.ends = False
+        self.ends = self.tired = False
 
     def on_failure(self, failed):
         self.failed = failed

@@ -60,7 +60,7 @@ def test_answer_that_another_thread_brings_at_once_is_sent_once(raw, monkeypatch
         time.sleep(0.1)  # as if the kernel had let the other thread run
         return send_what_fits(connection, answer)
 
-    def brought_by_another(message, reply, identity, subject=None):
+    def brought_by_another(message, reply, identity, subject=None, lends=False):
         answers = queue.SimpleQueue()
         submit(message, answers.put, identity)
         answer = answers.get(timeout=30)

@@ -1,6 +1,7 @@
 """The store thread writes in order, shares commits, and reports what is kept and nothing else."""
 
 import threading
+from functools import partial
 
 import pytest
 from store_writer import outcome_record, persist, reopened, slot_record
@@ -20,12 +21,19 @@ class GatedStore:
         self.gate = threading.Event()
         self.entered = threading.Event()
         self.batches = []
+        self.writers = []
+        self.holding = None
 
     def write(self, batch):
         self.entered.set()
         assert self.gate.wait(WAIT_S)
+        self.writers.append(threading.current_thread())
         self.store.write(batch)
         self.batches.append(len(batch))
+
+    @property
+    def tired(self):
+        return self.store.tired
 
     def rest(self):
         self.store.rest()
@@ -138,4 +146,114 @@ def test_close_from_the_failure_callback_does_not_hang(gated):
     gated.gate.set()
     thread.submit(persist(slot_record("a", 1), ticket=1))
     assert ended.wait(WAIT_S)
+    thread.close()
+
+
+# ---------------------------------------------------------------- threads that lend themselves
+
+
+def in_thread(act):
+    """Run `act` in a thread, which is returned; only the main thread lends itself to nobody."""
+    thread = threading.Thread(target=act)
+    thread.start()
+    return thread
+
+
+def lent(thread, *tickets, size=200):
+    """Submit records with these tickets, and write them in the calling thread if it is free."""
+    for ticket in tickets:
+        record = slot_record("a", ticket, size=size)
+        thread.submit(persist(record, ticket=ticket), wake=False)
+    thread.write_here()
+
+
+def test_a_thread_that_lends_itself_writes_and_reports(gated):
+    """Two records that one thread has left to itself are one batch, written by that thread."""
+    kept = []
+    gated.gate.set()
+    thread = StoreThread(
+        gated, lambda tickets: kept.append((threading.current_thread(), tickets)), pytest.fail
+    )
+    lender = in_thread(lambda: lent(thread, 1, 2))
+    lender.join(WAIT_S)
+    assert gated.writers == [lender]
+    assert kept == [(lender, [1, 2])]
+    thread.close()
+
+
+def test_what_comes_while_a_thread_writes_is_written_by_the_store_thread(gated):
+    """Neither the one that writes nor the one that comes meanwhile is kept for the next batch."""
+    kept = []
+    thread = StoreThread(gated, kept.extend, pytest.fail)
+    first = in_thread(lambda: lent(thread, 1))
+    assert gated.entered.wait(WAIT_S)
+    second = in_thread(lambda: lent(thread, 2, 3))
+    second.join(WAIT_S)
+    assert not second.is_alive()
+    gated.gate.set()
+    first.join(WAIT_S)
+    thread.close()
+    assert kept == [1, 2, 3]
+    assert gated.batches == [1, 2]
+    assert gated.writers[0] is first
+    assert gated.writers[1] not in {first, second}
+
+
+@pytest.mark.parametrize("holding", [None, object()], ids=["main thread", "database"])
+def test_who_may_not_be_kept_waiting_leaves_it_to_the_store_thread(gated, holding):
+    """Ctrl-C may end the main thread anywhere, and a database may take its time."""
+    kept = threading.Event()
+    gated.gate.set()
+    gated.holding = holding
+    thread = StoreThread(gated, lambda _: kept.set(), pytest.fail)
+    if holding is None:
+        lent(thread, 1)
+    else:
+        in_thread(lambda: lent(thread, 1)).join(WAIT_S)
+    assert kept.wait(WAIT_S)
+    assert [writer.name for writer in gated.writers] == ["enact-store"]
+    thread.close()
+
+
+def test_close_waits_for_a_thread_that_lends_itself(gated):
+    """The store may be closed afterwards: no thread uses it any more."""
+    kept = []
+    thread = StoreThread(gated, kept.extend, pytest.fail)
+    lender = in_thread(lambda: lent(thread, 1))
+    assert gated.entered.wait(WAIT_S)
+    closed = in_thread(lambda: (thread.close(), kept.append("closed")))
+    thread._thread.join(WAIT_S)  # the store's own thread, which has nothing to write
+    gated.gate.set()
+    lender.join(WAIT_S)
+    closed.join(WAIT_S)
+    assert kept == [1, "closed"]
+
+
+def test_a_store_that_fails_in_a_lent_thread_acknowledges_nothing(gated):
+    """The failure is reported once, and `close` from there neither hangs nor writes."""
+    failures = []
+
+    def end(failure):
+        failures.append(failure)
+        thread.close()
+
+    thread = StoreThread(gated, pytest.fail, end)
+    gated.store.close()
+    gated.gate.set()
+    in_thread(lambda: lent(thread, 1)).join(WAIT_S)
+    in_thread(lambda: lent(thread, 2)).join(WAIT_S)
+    (failure,) = failures
+    assert isinstance(failure, StoreError)
+
+
+def test_the_store_thread_tidies_up_after_a_lent_one(gated, tmp_path):
+    """The answer does not wait for files to be unlinked, and they are."""
+    gated.gate.set()
+    rested = threading.Event()
+    gated.rest = lambda: (gated.store.rest(), rested.set())
+    thread = StoreThread(gated, lambda _: None, pytest.fail)
+    for version in (1, 2):
+        in_thread(partial(lent, thread, version, size=100_000)).join(WAIT_S)
+    assert rested.wait(WAIT_S)
+    assert len(list((tmp_path / "blobs").iterdir())) == 1
     thread.close()

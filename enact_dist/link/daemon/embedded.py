@@ -120,7 +120,9 @@ class EmbeddedCarrier:
         if self._host.ended:
             call.done.release()
         else:
-            self._host.submit(message, call)
+            self._host.submit(message, call, lends=True)
+            if call.answer is None:
+                self._host.write_here()
         return call
 
     def _check_usable(self) -> None:

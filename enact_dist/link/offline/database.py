@@ -49,6 +49,7 @@ _STOP: Final = "stop all daemons of the cell first; nothing was changed"
 class _SharedMedium:
     """The medium of one shard in the transaction of all; see `link.store.media.Medium`."""
 
+    tired = False
     holding = None
     """The transaction holds the shard's row."""
 

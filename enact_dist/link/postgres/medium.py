@@ -44,6 +44,8 @@ class PostgresMedium:
         renewer: Renews the lease from now on; this medium closes it.
     """
 
+    tired = False
+
     def __init__(self, tenure: HeldRow, session: DatabaseSession, renewer: Renewer) -> None:
         self.name = tenure.name
         self.holding = self

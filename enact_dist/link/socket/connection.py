@@ -186,8 +186,10 @@ class SocketConnection:
                     self.step = step = step + 1
                     self._send(Refused(PERMISSION, str(error)))
                     continue
-            host.submit(message, self._take, self.identity, self.subject)
+            host.submit(message, self._take, self.identity, self.subject, True)
             self.step = step = step + 1
+            if self._answer is None:
+                host.write_here()
             answer, self._answer = self._answer, None
             if answer is not None:
                 self._send(answer)

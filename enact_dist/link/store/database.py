@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from enact_dist.link.folder.lock import file_mode
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
 _PRAGMAS: Final = (
@@ -35,6 +35,10 @@ _TABLE: Final = """CREATE TABLE record (
     id INTEGER PRIMARY KEY, kind INTEGER NOT NULL, batch INTEGER NOT NULL,
     key BLOB NOT NULL, body BLOB NOT NULL, crc INTEGER NOT NULL
 )"""
+_PUT: Final = "INSERT OR REPLACE INTO record VALUES "
+_ROW: Final = "(?, ?, ?, ?, ?, ?)"
+FEW_ROWS: Final = 8
+"""So many rows are put by one statement in place of four calls: 12 in place of 22 us for two."""
 _CORRUPT: Final = frozenset({sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_FORMAT})
 
 
@@ -108,7 +112,7 @@ class Database:
         )
         yield from map(DatabaseRow._make, cursor)
 
-    def commit(self, rows: Iterable[DatabaseRow], gone: Iterable[int], *, forced: bool) -> None:
+    def commit(self, rows: Sequence[DatabaseRow], gone: Sequence[int], *, forced: bool) -> None:
         """Put `rows` and delete those with an id in `gone`, atomically.
 
         With `forced` everything committed so far is on the disk when this returns.
@@ -116,14 +120,15 @@ class Database:
         if forced != self._forced:
             self._connection.execute(f"PRAGMA synchronous={'FULL' if forced else 'NORMAL'}")
             self._forced = forced
+        if not gone and 0 < len(rows) <= FEW_ROWS:  # one statement is atomic by itself
+            values = [value for row in rows for value in row]
+            self._connection.execute(_PUT + ", ".join([_ROW] * len(rows)), values)
+            return
         self._connection.execute("BEGIN IMMEDIATE")
         try:
-            self._connection.executemany(
-                "DELETE FROM record WHERE id = ?", ((row_id,) for row_id in gone)
-            )
-            self._connection.executemany(
-                "INSERT OR REPLACE INTO record VALUES (?, ?, ?, ?, ?, ?)", rows
-            )
+            deleted = ((row_id,) for row_id in gone)
+            self._connection.executemany("DELETE FROM record WHERE id = ?", deleted)
+            self._connection.executemany(_PUT + _ROW, rows)
             self._connection.execute("COMMIT")
         except BaseException:
             with contextlib.suppress(sqlite3.Error):

@@ -71,7 +71,7 @@ class Medium(Protocol):
         self,
         batch: int,
         rows: Sequence[DatabaseRow],
-        gone: Iterable[int],
+        gone: Sequence[int],
         unnamed: Iterable[Blob] = (),
         *,
         forced: bool,
@@ -85,6 +85,10 @@ class Medium(Protocol):
             unnamed: Bodies that no row names any more.
             forced: Whether everything so far must survive a power cut when this returns.
         """
+
+    @property
+    def tired(self) -> bool:
+        """Whether `rest` has something to do."""
 
     def rest(self) -> None:
         """Do what can wait until a batch is acknowledged."""

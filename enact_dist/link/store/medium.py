@@ -102,7 +102,7 @@ class FolderMedium:
         self,
         batch: int,
         rows: Sequence[DatabaseRow],
-        gone: Iterable[int],
+        gone: Sequence[int],
         unnamed: Iterable[Blob] = (),
         *,
         forced: bool,
@@ -132,6 +132,11 @@ class FolderMedium:
         if forced:
             self._rubbish += self._rubbish_once_forced
             self._rubbish_once_forced.clear()
+
+    @property
+    def tired(self) -> bool:
+        """Whether there are files to unlink, or the log is long."""
+        return bool(self._rubbish) or self._log_bytes > LOG_BYTES
 
     def rest(self) -> None:
         """Do what can wait until a batch is acknowledged: unlink files, shorten the log."""

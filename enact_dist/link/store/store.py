@@ -164,6 +164,11 @@ class Store:
         changes: dict[Key, bytes | None] = {EPOCH_KEY: epoch_body(self._epoch)}
         self._guarded(lambda: self._commit(changes, forced=True))
 
+    @property
+    def tired(self) -> bool:
+        """Whether `rest` has something to do."""
+        return self._medium.tired
+
     def rest(self) -> None:
         """Do what can wait until a batch is acknowledged: unlink files, shorten the log.
 
