@@ -14,18 +14,22 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import threading
+import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from enact_dist.access.lock import Lock
+from enact_dist.actor.actor import Actor
+from enact_dist.actor.running.runner import run_actor
 from enact_dist.bench.cases.updates import floor_of
 from enact_dist.bench.floors import SIZES, mapped, reply, written
-from enact_dist.bench.place import EMBEDDED
+from enact_dist.bench.place import EMBEDDED, WORLD
 from enact_dist.bench.rows import Case, Key, at_most, times
 from enact_dist.bench.timing import timed
-from enact_dist.terms import Aspect, Durability, Entity, Read, Write
+from enact_dist.terms import Aspect, Durability, Entity, Read, World, Write
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -34,7 +38,10 @@ if TYPE_CHECKING:
 
     from enact_dist.bench.run import Run
     from enact_dist.verify.daemons import LineProcess
+    from enact_dist.world.cell import Cell
     from enact_dist.world.context import WorldContext
+
+    _Woken = Callable[[Cell, Entity, Callable[[], None], Callable[[Any], bool]], None]
 
 SMALL: Final = "1 kB"
 LARGEST: Final = "100 MB"
@@ -261,57 +268,91 @@ def _storing(world: WorldContext, size: str, count: int) -> Callable[[float], Se
 
 
 def run_wakeup(run: Run) -> None:
-    """From the commit of a change in one process to another one that has it, under a lock."""
+    """From the commit of a change in one process to another one that has it, under a lock.
+
+    A watch tells of the change, and a lock then fetches it; the lock of an actor waits for it.
+    """
     floor = floor_of(run.place.way(run.place.carrier))
+    ways = {"{}": _woken_by_watch, "{}, as an actor": _woken_as_actor}
     run.measure(
         [
             Case(
                 "wakeup",
-                size,
-                _waking(run, count, gap_s),
+                way.format(size),
+                _waking(run, count, gap_s, woken),
                 floor,
                 at_most(goal_us, f"≤ {goal_us / 1e3:g} ms"),
             )
             for size, (count, goal_us, gap_s) in WAKEUPS.items()
+            for way, woken in ways.items()
         ]
     )
 
 
-def _waking(run: Run, size: int, gap_s: float) -> Callable[[float], Sequence[float]]:
-    place = run.place
-    world = place.world(place.carrier)
-    of = Entity(f"wakeup/{size}")
-    read = Read(world, of, ARRAY)
+def _waking(run: Run, size: int, gap_s: float, woken: _Woken) -> Callable[[float], Sequence[float]]:
+    place, of = run.place, Entity(f"wakeup/{size}")
+    place.world(place.carrier)
 
     def measure(seconds_s: float) -> Sequence[float]:
-        from time import perf_counter_ns
-
         count = max(5, math.ceil(seconds_s / (gap_s + 0.002)))
         options: dict[str, Any] = {
             "entity": of.name, "bytes": size, "gap_s": gap_s, "count": count,
         }  # fmt: skip
         found: dict[int, float] = {}
-        with (
-            place.worker("notifier", carrier=place.carrier, **options) as notifier,
-            world.watch(of, ARRAY) as watch,
-        ):
-            notifier.tell("go")
-            last = -1
-            while last < count - 1:
-                if watch.next(timeout_s=WAIT_S) is None:
-                    notifier.expect("done:", timeout_s=0.0)
-                    break
-                with Lock(read, wait_s=WAIT_S) as lock:
-                    # From here on the array can be used; the clock is the same in all processes.
-                    seq, sent_ns = (int(number) for number in lock[read][:16].view(np.int64))
-                    had_ns = perf_counter_ns()
-                if seq > last:
-                    last = seq
-                    found[seq] = (had_ns - sent_ns) / 1e3
+
+        def take(array: NDArray[np.uint8]) -> bool:
+            """Note when an array can be used; return whether it is the last one."""
+            # The clock is the same in all processes.
+            seq, sent_ns = (int(number) for number in array[:16].view(np.int64))
+            had_ns = time.perf_counter_ns()
+            if seq >= 0:
+                found.setdefault(seq, (had_ns - sent_ns) / 1e3)
+            return seq == count - 1
+
+        with place.worker("notifier", carrier=place.carrier, **options) as notifier:
+            woken(place.cell(place.carrier), of, lambda: notifier.tell("go"), take)
             notifier.expect("done:", timeout_s=WAIT_S)
         return list(found.values())
 
     return measure
+
+
+def _woken_by_watch(
+    cell: Cell, of: Entity, begin: Callable[[], None], take: Callable[[Any], bool]
+) -> None:
+    world, over = cell.world(WORLD), False
+    read = Read(world, of, ARRAY)
+    with world.watch(of, ARRAY) as watch:
+        begin()
+        while not over and watch.next(timeout_s=WAIT_S) is not None:
+            with Lock(read, wait_s=WAIT_S) as lock:
+                over = take(lock[read])
+
+
+def _woken_as_actor(
+    cell: Cell, of: Entity, begin: Callable[[], None], take: Callable[[Any], bool]
+) -> None:
+    class Woken(Actor):
+        """Takes each array; the first one was there before."""
+
+        array = Read(World(WORLD), of, ARRAY)
+        triggers = (array,)
+
+        def update(self, lock: Lock) -> None:
+            """Take one array."""
+            if not begun.is_set():
+                begun.set()
+                begin()
+            if take(lock[self.array]):
+                stop.set()
+
+    begun, stop = threading.Event(), threading.Event()
+    late = threading.Timer(2 * WAIT_S, stop.set)
+    late.start()
+    try:
+        run_actor(Woken(), cell, stop=stop)
+    finally:
+        late.cancel()
 
 
 def said(numbers: Sequence[Any]) -> str:
