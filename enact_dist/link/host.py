@@ -134,7 +134,7 @@ class ShardHost:
         self._each_tick: tuple[Callable[[], None], ...] = ()
         self._failure: Exception | None = None
         self._ended = False
-        self._draining = self._stops_now = self._lent = False
+        self._draining = self._stops_now = self._lent = self._queued = False
         self._rests = threading.Event()
         self._wake = threading.Condition(threading.Lock())
         self._look_again = False
@@ -196,41 +196,42 @@ class ShardHost:
         identity: str = "",
         subject: str | None = None,
         lends: bool = False,
-    ) -> None:
+    ) -> bool:
         """Pass a request to the shard; `reply` is called once, now or later, from any thread.
 
         If the host ends first, `reply` is never called: no answer means *unknown*.  `identity` is
         the sender ("": this process), `subject` whose rights it uses (None: no name is proven).
-        Who `lends` its thread calls `write_here` next, if the answer is not there yet.
+        Who `lends` its thread and gets True calls `write_here` next, which the answer awaits.
         """
         kind = type(message)
         if kind is Commit or kind is Prepare:
             commit: Commit = message  # type: ignore[assignment]  # as just found
             if self.silence and (too_large := self.silence.too_large(commit, self._shard.state)):
                 reply(too_large)
-                return
+                return False
             if names_payloads(commit) and self._refusal(commit, identity) is None:
                 message = self.payloads.with_bodies(commit)  # otherwise staged data stay
         elif kind is Stage:
             self._stage(cast("Stage", message), reply, identity, subject)
-            return
+            return False
         elif kind is ListSessions:
             more = self.silence.rounded() if self.silence else {}
             self._shard.counters.update(self.payloads.figures() | more)
         with self._mutex:
             if self._ended:
-                return
+                return False
             if len(self._replies) >= PARKED_MAX:
                 self.count("overloads")
                 reply(Refused("overload", f"{PARKED_MAX} requests are parked at shard {self.name}"))
-                return
+                return False
             self._handles += 1
             self._replies[self._handles] = reply
-            self._lent = lends
+            self._lent, self._queued = lends, False
             self._handle(message, self._handles, identity, subject)
             self._lent = False
-            if self._handles in self._replies or kind is Hello:
+            if (parked := self._handles in self._replies) or kind is Hello:
                 self._look_at_clock_for(message)
+            return lends and parked and self._queued
 
     def write_here(self) -> None:
         """Write what the last `submit` has left to this thread; see `StoreThread`."""
@@ -380,6 +381,7 @@ class ShardHost:
         if isinstance(effect, Persist):
             if self._store_thread is not None:
                 self._store_thread.submit(effect, wake=False)
+                self._queued = True
         elif isinstance(effect, Compare):
             self._compare(effect)
         elif self._call is not None:

@@ -9,6 +9,7 @@ from enact_dist.core.protocol.messages import Granted, ListLocks, ListSessions, 
 from enact_dist.errors import MisuseError, ShardUnreachableError
 from enact_dist.link.daemon.embedded import EmbeddedCarrier
 from enact_dist.link.opening import open_host
+from enact_dist.link.store.store import Store
 
 
 @pytest.fixture
@@ -56,6 +57,39 @@ def test_carrier_waits_for_a_parked_answer_from_another_thread(embedded, make_pe
     thread.join(90)
 
     assert [type(answer) for answer in answers] == [Granted]
+
+
+@pytest.mark.parametrize("in_main", [True, False], ids=["main thread", "thread"])
+def test_carrier_gives_up_a_commit_in_time_while_the_disk_stands_still(
+    make_settings, make_peer, tmp_path, monkeypatch, in_main
+):
+    """The calling thread never writes itself: the disk may take longer than the call may."""
+    host = open_host(make_settings(durability="durable"), tmp_path)
+    goes_on, write = threading.Event(), Store.write
+    embedded = EmbeddedCarrier(host, "me")
+    peer = make_peer(lambda _, asked: embedded.request("s0", asked, timeout_s=20.0))
+    peer.hello()
+    granted = peer.acquire("cup")
+    answers = []
+
+    def commit():
+        peer.call = lambda _, asked: embedded.request("s0", asked, timeout_s=0.05)
+        answers.append(peer.commit(granted, "cup", b"x"))
+
+    monkeypatch.setattr(
+        Store, "write", lambda store, batch: goes_on.wait(20.0) and write(store, batch)
+    )
+    try:
+        if in_main:
+            commit()
+        else:
+            thread = threading.Thread(target=commit)
+            thread.start()
+            thread.join(10.0)
+        assert answers == [None]
+    finally:
+        goes_on.set()
+        host.close()
 
 
 def test_carrier_shows_its_session_as_present_until_it_is_closed(host, make_peer):

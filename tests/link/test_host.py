@@ -216,8 +216,7 @@ def test_a_lent_thread_leaves_nothing_in_the_queue(start, make_peer, monkeypatch
         peer.commit(granted, "cup", b"y")
 
     def lend():
-        host.submit(sent[0], answers.append, lends=True)
-        if not answers:
+        if host.submit(sent[0], answers.append, lends=True):
             host.write_here()
 
     lender = threading.Thread(target=lend)
@@ -226,6 +225,31 @@ def test_a_lent_thread_leaves_nothing_in_the_queue(start, make_peer, monkeypatch
 
     assert len(answers) == 1
     assert store.written.acquire(timeout=30)
+
+
+def test_only_a_request_with_records_of_its_own_lends_its_thread(start, make_peer):
+    """Who waits for a lock does not wait for a disk that writes what others commit."""
+    store = FakeStore()
+    store.may_write.set()
+    host = start(store, durability="durable")
+    holder, waiter, keeper = (make_peer(call_of(host), durability="durable") for _ in range(3))
+    for peer in (holder, waiter, keeper):
+        peer.hello()
+    cup, tray = keeper.acquire("cup"), holder.acquire("tray")
+    sent, answers = [], []
+    holder.call = lambda _, message: sent.append(message)
+    holder.commit(tray, "tray", b"x")
+    store.may_write.clear()
+
+    left = [
+        host.submit(message, answers.append, lends=True)
+        for message in (sent[0], waiter.acquire_message("cup", wait_s=9.0), ListLocks())
+    ]
+    store.may_write.set()
+
+    assert isinstance(cup, Granted)
+    assert left == [True, False, False]
+    assert [type(answer) for answer in answers] == [Locks]
 
 
 def test_host_acknowledges_nothing_when_the_store_fails(start, make_peer):

@@ -67,7 +67,7 @@ def submitted(monkeypatch):
 
     def submit(host, message, reply, identity="", subject=None, lends=False):
         found.append((type(message), identity, subject))
-        real(host, message, reply, identity, subject, lends)
+        return real(host, message, reply, identity, subject, lends)
 
     monkeypatch.setattr(ShardHost, "submit", submit)
     return found

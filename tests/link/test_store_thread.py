@@ -153,7 +153,7 @@ def test_close_from_the_failure_callback_does_not_hang(gated):
 
 
 def in_thread(act):
-    """Run `act` in a thread, which is returned; only the main thread lends itself to nobody."""
+    """Run `act` in a thread, which is returned."""
     thread = threading.Thread(target=act)
     thread.start()
     return thread
@@ -199,17 +199,13 @@ def test_what_comes_while_a_thread_writes_is_written_by_the_store_thread(gated):
     assert gated.writers[1] not in {first, second}
 
 
-@pytest.mark.parametrize("holding", [None, object()], ids=["main thread", "database"])
-def test_who_may_not_be_kept_waiting_leaves_it_to_the_store_thread(gated, holding):
-    """Ctrl-C may end the main thread anywhere, and a database may take its time."""
+def test_a_database_may_take_its_time(gated):
+    """Its records are left to the store's thread."""
     kept = threading.Event()
     gated.gate.set()
-    gated.holding = holding
+    gated.holding = object()
     thread = StoreThread(gated, lambda _: kept.set(), pytest.fail)
-    if holding is None:
-        lent(thread, 1)
-    else:
-        in_thread(lambda: lent(thread, 1)).join(WAIT_S)
+    in_thread(lambda: lent(thread, 1)).join(WAIT_S)
     assert kept.wait(WAIT_S)
     assert [writer.name for writer in gated.writers] == ["enact-store"]
     thread.close()
@@ -242,6 +238,22 @@ def test_a_store_that_fails_in_a_lent_thread_acknowledges_nothing(gated):
     gated.gate.set()
     in_thread(lambda: lent(thread, 1)).join(WAIT_S)
     in_thread(lambda: lent(thread, 2)).join(WAIT_S)
+    (failure,) = failures
+    assert isinstance(failure, StoreError)
+
+
+def test_the_store_thread_that_waited_for_a_lent_one_reports_no_second_failure(gated, until):
+    """Once the store has failed, nobody tidies it up either."""
+    failures = []
+    thread = StoreThread(gated, pytest.fail, failures.append)
+    lender = in_thread(lambda: lent(thread, 1))
+    assert gated.entered.wait(WAIT_S)
+    thread.submit(persist(slot_record("a", 2), ticket=2))
+    until(lambda: not thread._wake._waiters)  # the store's thread waits for its turn
+    gated.store.close()
+    gated.gate.set()
+    lender.join(WAIT_S)
+    thread.close()
     (failure,) = failures
     assert isinstance(failure, StoreError)
 

@@ -120,9 +120,7 @@ class EmbeddedCarrier:
         if self._host.ended:
             call.done.release()
         else:
-            self._host.submit(message, call, lends=True)
-            if call.answer is None:
-                self._host.write_here()
+            self._host.submit(message, call)  # a lent thread would see no end of its time
         return call
 
     def _check_usable(self) -> None:

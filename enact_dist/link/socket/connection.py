@@ -186,9 +186,9 @@ class SocketConnection:
                     self.step = step = step + 1
                     self._send(Refused(PERMISSION, str(error)))
                     continue
-            host.submit(message, self._take, self.identity, self.subject, True)
+            left = host.submit(message, self._take, self.identity, self.subject, True)
             self.step = step = step + 1
-            if self._answer is None:
+            if left:
                 host.write_here()
             answer, self._answer = self._answer, None
             if answer is not None:

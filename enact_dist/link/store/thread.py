@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import threading
 import time
-from threading import get_ident
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.state.clock import Latencies
@@ -52,13 +51,12 @@ class StoreThread:
     ) -> None:
         self._store = store
         self._takes_loans = store.holding is None  # a database may take its time
-        self._main = threading.main_thread().ident
         self._done = done
         self._failed = failed
         self._pen = threading.Lock()  # of who writes, and then looks for what was queued meanwhile
         self._wake = threading.Condition(threading.Lock())
         self.queue: list[Persist] = []
-        self._ending = False
+        self._ending = self._broken = False
         self.writing_since_s: float | None = None
         self.latencies = Latencies()
         self._thread = threading.Thread(target=self._run, name="enact-store", daemon=True)
@@ -85,10 +83,10 @@ class StoreThread:
     def write_here(self) -> None:
         """Write and report what is queued, in the calling thread unless another one writes.
 
-        The main thread, which Ctrl-C may interrupt anywhere, wakes the store's thread instead.
-        Do not call it while holding a lock that `done` or `failed` takes.
+        It takes as long as the disk does, and no Ctrl-C may come in between: not for the main
+        thread.  Do not call it while holding a lock that `done` or `failed` takes.
         """
-        if not self._takes_loans or get_ident() == self._main:
+        if not self._takes_loans:
             self.wake()
         elif self.queue and self._pen.acquire(blocking=False):
             self._write()
@@ -131,11 +129,11 @@ class StoreThread:
                 self.writing_since_s = None
                 self.latencies.add(time.monotonic() - started_s)
                 self._report([persist.ticket for persist in batch if persist.ticket])
-            if rests:
+            if rests and not self._broken:
                 self._store.rest()
         except Exception as failure:  # noqa: BLE001 - whatever it was, nothing may be acknowledged
             with self._wake:
-                self._ending = True
+                self._ending = self._broken = True
                 self.queue.clear()
                 self._wake.notify()
             self._pen.release()
