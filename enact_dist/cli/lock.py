@@ -31,8 +31,9 @@ if TYPE_CHECKING:
 
     from enact_dist.core.protocol.messages import Item
     from enact_dist.link.client.locks import CellClient
+    from enact_dist.operate.cell_rows import ShardRates
     from enact_dist.world.cell import Cell
-    from enact_dist.world.listings import LockInfo
+    from enact_dist.world.listings import LockInfo, ShardInfo
 
 POLL_S: Final = 0.05
 """How soon a lost lock or an ended command is noticed."""
@@ -171,9 +172,14 @@ def in_reach(cell: Cell) -> tuple[tuple[str, ...], int]:
             reachable.append(shard.name)
         else:
             status = UNREACHABLE
-            why = f": {shard.problem}" if shard.problem else " does not answer"
-            print(f"enact: shard {shard.name} at {shard.endpoint}{why}", file=sys.stderr)
+            name_away(shard)
     return tuple(reachable), status
+
+
+def name_away(shard: ShardInfo | ShardRates) -> None:
+    """Print which shard does not answer, and why if that is known."""
+    why = f": {shard.problem}" if shard.problem else " does not answer"
+    print(f"enact: shard {shard.name} at {shard.endpoint}{why}", file=sys.stderr)
 
 
 def _row(lock: LockInfo, known: dict[tuple[str, int], LockInfo]) -> tuple[object, ...]:

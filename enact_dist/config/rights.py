@@ -182,22 +182,6 @@ class SecurityConfig:
         return tuple(name for name in self.operators if not _USER.match(name))
 
 
-def is_rights(found: object) -> RightsConfig:
-    """Return the table `[rights]`; for the key's `make`."""
-    if not isinstance(found, RightsConfig):
-        raise ValueError("'rights' is a table: [rights]")  # noqa: TRY004 - a ConfigError in the end
-    return found
-
-
-def is_security(found: object) -> SecurityConfig:
-    """Return the table `[security]`; for the key's `make`."""
-    if not isinstance(found, SecurityConfig):
-        raise ValueError(  # noqa: TRY004 - as above
-            "'security' is a table; write [security] and below it keys = \"keys\""
-        )
-    return found
-
-
 # ---------------------------------------------------------------- what a shard gets
 
 

@@ -151,8 +151,12 @@ class Shows:
         return _frame(self.parent, entity)
 
 
+def _by_pattern(frames: Frames) -> Mapping[str, str]:
+    return {"**": frames} if isinstance(frames, str) else frames
+
+
 def _check_frames(frames: Frames) -> None:
-    for pattern, text in ({"**": frames} if isinstance(frames, str) else frames).items():
+    for pattern, text in _by_pattern(frames).items():
         try:
             Entities(pattern)
         except ValueError as error:
@@ -163,8 +167,7 @@ def _check_frames(frames: Frames) -> None:
 
 def _frame(frames: Frames, entity: str) -> str:
     """Return the frame of the first pattern that covers the entity, filled in."""
-    by_pattern = {"**": frames} if isinstance(frames, str) else frames
-    for pattern, text in by_pattern.items():
+    for pattern, text in _by_pattern(frames).items():
         if pattern_matches(pattern, entity):
             return _PLACE.sub(lambda place: _segment(place[1], entity), text)
     return ""

@@ -262,9 +262,11 @@ class Table:
         if typing.get_origin(kind) is tuple and typing.get_args(kind)[-1] is Ellipsis:
             return self._items(name, one)
         if one.key.table is not None:
-            is_table = isinstance(found, dict)
-            given = self.table(name).record(one.key.table) if is_table else found
-            return self._ready(name, one, given)
+            if isinstance(found, dict):
+                found = self.table(name).record(one.key.table)
+            elif one.key.make is None:
+                self.refuse(name, f"{name!r} is a table; write {one.key.example}")
+            return self._ready(name, one, found)
         if typing.get_origin(kind) is Mapping:
             return self._mapping(name, one)
         if isinstance(kind, types.UnionType) and isinstance(found, dict):

@@ -15,13 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, NamedTuple
 
-from enact_dist.config.rights import (
-    RightsConfig,
-    SecurityConfig,
-    compiled_rights,
-    is_rights,
-    is_security,
-)
+from enact_dist.config.rights import RightsConfig, SecurityConfig, compiled_rights
 from enact_dist.config.shows import GUESSED, Shows
 from enact_dist.config.table import TableKey
 from enact_dist.core.protocol.messages import AspectEntry, Pin, PlacementMap, ShardEntry
@@ -311,9 +305,10 @@ class CellConfig:
     data_folder: Annotated[Path | None, TableKey(variable="DATA_FOLDER")] = None
     store: Annotated[str, TableKey(make=checked_store, variable="STORE")] = ""
     lease_s: Annotated[float, TableKey(low=LEASE_S_MIN, high=LEASE_S_MAX)] = LEASE_S_DEFAULT
-    security: Annotated[SecurityConfig, TableKey(table=SecurityConfig, make=is_security)] = field(
-        default_factory=SecurityConfig
-    )
+    security: Annotated[
+        SecurityConfig,
+        TableKey(table=SecurityConfig, example='[security] and below it keys = "keys"'),
+    ] = field(default_factory=SecurityConfig)
     worlds: Annotated[
         tuple[str, ...], TableKey(make=partial(checked_name, "world context", slashes=False))
     ] = ()
@@ -321,7 +316,7 @@ class CellConfig:
     pins: Annotated[tuple[Pin, ...], TableKey(table=PinTable, make=Pin._make)] = ()
     aspects: tuple[AspectConfig, ...] = ()
     actors: tuple[ActorConfig, ...] = ()
-    rights: Annotated[RightsConfig | None, TableKey(table=RightsConfig, make=is_rights)] = None
+    rights: Annotated[RightsConfig | None, TableKey(table=RightsConfig, example="[rights]")] = None
 
     @property
     def actor_names(self) -> tuple[str, ...]:

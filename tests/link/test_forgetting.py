@@ -283,7 +283,7 @@ def test_unknown_aspects_are_refused(tmp_path):
     folders = two_stores(tmp_path, left=[HERE])
     for act in (look, lambda *words: forget(*words, now_ns=NOW_NS)):
         with pytest.raises(
-            MisuseError, match=r"no shard here has an aspect spect \(known: aspect\)"
+            MisuseError, match=r"an aspect spect; did you mean 'aspect'\? \(known: aspect\)"
         ):
             act(folders, ["aspect", "spect"])
     assert of_aspect(folders["left"], "aspect") == (True, 1, 0)

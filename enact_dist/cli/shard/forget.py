@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from enact_dist.cli.arguments import pairs
-from enact_dist.cli.shard.shard import whole_store
+from enact_dist.cli.shard.shard import refuse_shared, whole_store
 from enact_dist.cli.target import cell_config
 from enact_dist.cli.text.output import ProgressLine, print_json, print_table, shown_bytes
 from enact_dist.cli.verbs import DONE, FAILED
@@ -22,11 +22,10 @@ from enact_dist.errors import ConfigError
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Collection, Iterable
+    from collections.abc import Iterable
 
     from enact_dist.config.types import CellConfig
     from enact_dist.link.offline.forgetting import Purged
-    from enact_dist.link.postgres.address import StoreAddress
 
 
 def run_forget(options: argparse.Namespace) -> int:
@@ -46,23 +45,22 @@ def run_forget(options: argparse.Namespace) -> int:
             f"--unused needs the data of all shards, but {'; '.join(elsewhere) or 'not all'}:"
             " name the folders of the others with --store"
         )
-    unused = config.worlds if options.unused else None
-    told = _Told(as_json=options.json, goes="goes" if options.yes else "would go")
     if not folders and database is None:
         raise ConfigError(f"no shard of {config.path} has its data here: {'; '.join(elsewhere)}")
+    told = _Told(as_json=options.json, goes="goes" if options.yes else "would go")
+    more: dict[str, Any] = {"unused": config.worlds if options.unused else None, "progress": told}
     try:
         if database is not None:
-            found = _in_database(database, options, unused, told)
+            from enact_dist.link.offline.database import forget_database
+
+            found = forget_database(
+                database, options.aspects, only=options.shard, now_ns=time.time_ns(),
+                dry_run=not options.yes, **more,
+            )  # fmt: skip
         elif options.yes:
-            found = forget(
-                folders,
-                options.aspects,
-                now_ns=time.time_ns(),
-                unused=unused,
-                progress=told,
-            )
+            found = forget(folders, options.aspects, now_ns=time.time_ns(), **more)
         else:
-            found = look(folders, options.aspects, unused=unused, progress=told)
+            found = look(folders, options.aspects, **more)
     finally:
         told.line.end()
     if options.json:
@@ -77,26 +75,6 @@ def run_forget(options: argparse.Namespace) -> int:
     words = _command(named, options.shard)
     print(f"enact: nothing was changed; to let it go: {words}", file=sys.stderr)
     return FAILED
-
-
-def _in_database(
-    database: StoreAddress,
-    options: argparse.Namespace,
-    unused: Collection[str] | None,
-    told: _Told,
-) -> Purged:
-    """Let aspects go in the database of a cell, in one transaction."""
-    from enact_dist.link.offline.database import forget_database
-
-    return forget_database(
-        database,
-        options.aspects,
-        only=options.shard,
-        now_ns=time.time_ns(),
-        unused=unused,
-        dry_run=not options.yes,
-        progress=told,
-    )
 
 
 def _command(aspects: Iterable[str], shards: Iterable[str] = ()) -> str:
@@ -135,8 +113,7 @@ def _folders(
             )
         else:
             folders[shard.name] = folder
-    if len({folder.resolve() for folder in folders.values()}) < len(folders):
-        raise ConfigError("two shards have the same folder; give each its own with --store")
+    refuse_shared(folders)
     return folders, elsewhere
 
 
@@ -178,17 +155,8 @@ class _Told:
         self._goes = goes
 
     def found(self, found: Purged) -> None:
-        """Say what goes.
-
-        Raises:
-            MisuseError: No shard here has ever known one of the aspects.
-        """
-        from enact_dist.access.session import unknown_aspect
-
+        """Say what goes."""
         self.line.end()
-        for name in found.aspects:
-            if name not in found.known:
-                raise unknown_aspect(name, found.known)
         if self._as_json:
             return
         if found.done:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.cli.arguments import pairs
-from enact_dist.cli.shard.shard import whole_store
+from enact_dist.cli.shard.shard import refuse_shared, whole_store
 from enact_dist.cli.target import cell_config
 from enact_dist.cli.text.output import ProgressLine, print_json, print_table, shown_bytes
 from enact_dist.cli.verbs import DONE
@@ -92,8 +92,7 @@ def _folders(config: CellConfig, stores: dict[str, str], new: list[str]) -> dict
         folders[name] = Path(stores[name])
         if not holds_store(folders[name]):
             raise ConfigError(f"--store {name}={stores[name]}: no shard has its data there")
-    if len({folder.resolve() for folder in folders.values()}) < len(folders):
-        raise ConfigError("two shards have the same folder; give each its own with --store")
+    refuse_shared(folders)
     return folders
 
 
@@ -177,7 +176,7 @@ class _Shown:
 
     def act(self, name: str) -> None:
         """Show what is done next."""
-        self._show(name)
+        self.line.show(f"{self._so_far}{name}", at_once=True)
 
     def moved(self, entities: int, size: int) -> None:
         """Show how much is where it belongs."""
@@ -185,7 +184,4 @@ class _Shown:
 
     def waits(self, wait_s: float) -> None:
         """Show what is waited for."""
-        self._show(f"waiting {shown_s(wait_s)} for leases to end")
-
-    def _show(self, text: str) -> None:
-        self.line.show(f"{self._so_far}{text}", at_once=True)
+        self.act(f"waiting {shown_s(wait_s)} for leases to end")

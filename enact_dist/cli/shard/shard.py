@@ -18,7 +18,8 @@ from enact_dist.world.trees import shown_s
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Collection, Sequence
+    from collections.abc import Collection, Mapping, Sequence
+    from pathlib import Path
 
     from enact_dist.config.types import CellConfig
     from enact_dist.link.daemon.health import ShardHealth
@@ -133,6 +134,16 @@ def refuse_database(config: CellConfig, does: str, remedy: str) -> None:
             f" {without_password(config.store)}: {remedy}",
             path=str(config.path),
         )
+
+
+def refuse_shared(folders: Mapping[str, Path]) -> None:
+    """Refuse two shards with one folder.
+
+    Raises:
+        ConfigError: There are two.
+    """
+    if len({folder.resolve() for folder in folders.values()}) < len(folders):
+        raise ConfigError("two shards have the same folder; give each its own with --store")
 
 
 def list_shards(options: argparse.Namespace) -> Output:

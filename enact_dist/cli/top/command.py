@@ -8,6 +8,7 @@ from contextlib import suppress
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.cli.lock import name_away
 from enact_dist.cli.target import open_cell
 from enact_dist.cli.text.output import print_json, print_table
 from enact_dist.cli.top.tables import TABLES, headline
@@ -73,5 +74,4 @@ def _print(cell: Cell, rates: CellRates, *, as_json: bool) -> None:
         if count > len(lines):
             print(f"… {count - len(lines)} more {table.title}: enact top --once --json lists them")
     for shard in rates.away:
-        why = f": {shard.problem}" if shard.problem else " does not answer"
-        print(f"enact: shard {shard.name} at {shard.endpoint}{why}", file=sys.stderr)
+        name_away(shard)

@@ -6,7 +6,7 @@ import math
 import sys
 import time
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.access.watch import Watch
 from enact_dist.cli.target import open_cell
@@ -48,13 +48,11 @@ def watch_world(options: argparse.Namespace) -> int:
         world = cell.world(options.world)
         aspects = tuple(dict.fromkeys(options.aspect or ()))
         _tell_unknown(aspects, cell)
-        shown: _Display = _Lines(world, options)
-        if options.stats:
-            shown = _Statistics(world, options)
+        shown = _Statistics(world, options) if options.stats else _Lines(world, options)
         client = world.session.client
         with Watch(client, (world.name,), (options.pattern,), aspects) as watch:
             begun_s = time.monotonic()
-            if options.stats:
+            if isinstance(shown, _Statistics):
                 shown.begin(_here(watch))
             for changes in _coming(watch, options, stop):
                 shown.show(changes)
@@ -97,19 +95,6 @@ def _coming(watch: Watch, options: argparse.Namespace, stop: StopSignals) -> Ite
             changes.append(change)
         left -= len(changes)
         yield changes
-
-
-class _Display(Protocol):
-    """Shows what a watch sees."""
-
-    def begin(self, changes: Iterable[Change]) -> None:
-        """Take the initial data, which are no change."""
-
-    def show(self, changes: list[Change]) -> None:
-        """Show what has come, if anything has."""
-
-    def end(self, seconds: float) -> None:
-        """Show what there was in all."""
 
 
 @dataclass(slots=True)
@@ -157,9 +142,6 @@ class _Lines:
         self._session = world.session
         self._as_json, self._with_data = options.json, options.data
         self._seen = _Seen()
-
-    def begin(self, changes: Iterable[Change]) -> None:
-        self.show(list(changes))
 
     def show(self, changes: list[Change]) -> None:
         if not changes:
@@ -271,6 +253,7 @@ class _Statistics:
         self._due_s = self._begun_s + self._every_s
 
     def begin(self, changes: Iterable[Change]) -> None:
+        """Take the initial data, which are no change."""
         self._rates.there(_slot(change) for change in changes if not change.null)
 
     def show(self, changes: list[Change]) -> None:

@@ -19,7 +19,7 @@ from enact_dist.core.offline.forgetting import world_drops
 from enact_dist.core.offline.moving import Shards
 from enact_dist.errors import StoreError
 from enact_dist.link.offline.cell import SILENT, refuse_obstacles, write
-from enact_dist.link.offline.forgetting import planned_purge, refuse_unknown
+from enact_dist.link.offline.forgetting import planned_purge
 from enact_dist.link.offline.rebalance import Rebalance, carry_out, wait_for_leases
 from enact_dist.link.postgres.address import StoreAddress
 from enact_dist.link.postgres.bodies import BodiesToWrite
@@ -236,7 +236,6 @@ def forget_database(
     with _opened(cell, progress, only, (), unix_s=unix_s, dry_run=dry_run) as (stores, stored):
         found, plan = planned_purge({}, stored, aspects, now_ns=now_ns, unused=unused)
         progress.found(found)
-        refuse_unknown(found)
         if not dry_run:
             for records in (plan.records, world_drops(stored, found.worlds)):
                 for name, some in records.items():

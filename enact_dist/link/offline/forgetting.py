@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
+from enact_dist.config.table import suggestion
 from enact_dist.core.offline.forgetting import planned, unused_aspects, unused_worlds, world_drops
 from enact_dist.errors import MisuseError
 from enact_dist.link.folder.marks import mark, under_way, unmark
@@ -80,7 +81,6 @@ def look(
     with opened(folders) as (_, stored):
         found, _ = planned_purge(_begun(folders), stored, aspects, now_ns=0, unused=unused)
     (progress or SILENT).found(found)
-    refuse_unknown(found)
     return found
 
 
@@ -111,7 +111,6 @@ def forget(
     with opened(folders, progress.act, unix_s=now_ns // 1_000_000_000) as (stores, stored):
         found, plan = planned_purge(_begun(folders), stored, aspects, now_ns=now_ns, unused=unused)
         progress.found(found)
-        refuse_unknown(found)
         if plan.records:
             begun = _begun(folders)
             at_ns = {name: begun.get(name, at_ns) for name, at_ns in plan.at_ns.items()}
@@ -147,6 +146,7 @@ def planned_purge(
 
     Raises:
         StoreError: There is an obstacle.
+        MisuseError: No shard ever knew one of the aspects.
     """
     worlds: tuple[str, ...] = ()
     if unused is not None:
@@ -155,6 +155,11 @@ def planned_purge(
     plan = planned(stored, aspects, now_ns=now_ns, begun=begun)
     refuse_obstacles("nothing was forgotten", plan.obstacles)
     known = plan.known | begun.keys()  # a restore may have removed all traces of the run
+    if unknown := [name for name in plan.names if name not in known]:
+        raise MisuseError(
+            f"no shard here has an aspect {', '.join(unknown)}{suggestion(unknown[0], known)}"
+            f" (known: {', '.join(sorted(known)) or 'none'}); nothing was forgotten"
+        )
     return Purged(plan.names, known, plan.going, bool(begun), plan.done, worlds), plan
 
 
@@ -166,17 +171,3 @@ def _begun(folders: Mapping[str, Path]) -> dict[str, int]:
     """
     marks = under_way(folders, forgets=True)
     return {name: at_ns for each in marks.values() for name, at_ns in each.aspects.items()}
-
-
-def refuse_unknown(found: Purged) -> None:
-    """Refuse aspects that no shard ever knew.
-
-    Raises:
-        MisuseError: There are some.
-    """
-    unknown = [name for name in found.aspects if name not in found.known]
-    if unknown:
-        raise MisuseError(
-            f"no shard here has an aspect {', '.join(unknown)} (known:"
-            f" {', '.join(sorted(found.known)) or 'none'}); nothing was forgotten"
-        )
