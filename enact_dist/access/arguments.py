@@ -107,14 +107,7 @@ def checked_as(kind: str, name: str, *, slashes: bool = False) -> str:
 
 
 def check_argument(call: str, name: str, found: object, *wanted: type[Any]) -> None:
-    """Raise `TypeError` unless an argument is of one of the wanted types.
-
-    Args:
-        call: The call as it is written: ``history(entity, aspect)``.
-        name: The argument's name.
-        found: What was given.
-        wanted: The types.
-    """
+    """Raise `TypeError` unless an argument is of one of the wanted types."""
     if not isinstance(found, wanted):
         raise wrong_argument(call, name, found, *wanted)
 

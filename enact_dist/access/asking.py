@@ -35,11 +35,6 @@ ASKED_MAX: Final = 256
 def expected(kind: type[A], asked: type[Any], answer: Answer) -> A:
     """Return an answer that must be of one kind.
 
-    Args:
-        kind: The kind.
-        asked: The type of the request, for the message.
-        answer: What the shard answered.
-
     Raises:
         EnactError: The error of a refusal.
         ProtocolError: The answer is of another kind.
@@ -98,12 +93,7 @@ def listed(
 ) -> tuple[VersionEntry, ...]:
     """Return what a shard knows of one slot's versions, oldest first.
 
-    Args:
-        client: The client that asks.
-        shard: The shard that stores the slot.
-        slot: The slot.
-        since_ns: Only versions that were current after this stamp.
-        count: At most this many, the newest ones (0: all).
+    It lists those that were current after `since_ns`, and at most the newest `count` (0: all).
 
     Raises:
         ShardUnreachableError: The shard does not answer.

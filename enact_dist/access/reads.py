@@ -321,13 +321,7 @@ def is_null(state: SlotState) -> bool:
 def null_error(
     slot: Slot, state: SlotState | None, aspects: Collection[str] | None = None
 ) -> NullDatumError:
-    """Return the error for reading a null slot, with the reason.
-
-    Args:
-        slot: The slot.
-        state: What was shown of it.
-        aspects: Those that the cell knows; None where that is of no matter.
-    """
+    """Return the error for reading a null slot, with the reason."""
     reason = NullReason[state.null_reason].value if state else NullReason.NEVER_SET.value
     unknown = ""
     if aspects is not None and slot.aspect not in aspects:

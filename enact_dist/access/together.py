@@ -140,11 +140,7 @@ class Together(Generic[T_co]):
         return self.within_s, self.least, self.least_after_s, self.newest_only
 
     def pending(self, names: Sequence[str]) -> PendingSets:
-        """Return an empty account of its sets.
-
-        Args:
-            names: What each of its data is called.
-        """
+        """Return an empty account of its sets."""
         first = self.requests[0].entity
         assert isinstance(first, Entity)
         return PendingSets(

@@ -96,14 +96,7 @@ def refuse_changed(
     written: Mapping[Slot, Datum | None],
     requests: Collection[LockRequest[Any]],
 ) -> None:
-    """Raise `MisuseError` if what a block could have written was changed and not assigned.
-
-    Args:
-        shown: What the block has looked at, as it was granted.
-        assigned: What it has looked at of its own writes, since it wrote them.
-        written: What it sets.
-        requests: Those of the lock.
-    """
+    """Raise `MisuseError` if what a block could have written was changed and not assigned."""
     looked_at = {slot: one for slot, one in shown.items() if slot not in written} | {**assigned}
     if not looked_at:
         return
@@ -180,12 +173,10 @@ class Asked(NamedTuple):
     """What a datum that is to be filled shall look like.
 
     Attributes:
-        datum_type: The aspect's type.
         like: A datum that looks so, or None.
         shape: In its place: of the array; of each array by field where the type is a dataclass.
         dtype: Of the array, or of all, or of each by field; None takes what the type is annotated
             with, float64 where it is not.
-        stamp_ns: When it was captured.
     """
 
     datum_type: Any

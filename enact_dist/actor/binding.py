@@ -53,12 +53,7 @@ class Watched:
 
 
 class Joined(NamedTuple):
-    """Where an actor runs.
-
-    Attributes:
-        cell: Its cell.
-        worlds: The world context of each of its roles.
-    """
+    """Where an actor runs."""
 
     cell: Cell
     worlds: Mapping[str, WorldContext]

@@ -77,10 +77,7 @@ class ActorFinding:
     """One thing that is wrong, or likely so, with the actors of a cell.
 
     Attributes:
-        level: "error", "warning" or "advice".
         kind: As in the table of this module.
-        actors: Names of the actors concerned.
-        text: What was found and what to do.
     """
 
     level: Level
@@ -416,12 +413,7 @@ def _unstamped_sets(uses: Sequence[Use]) -> Iterator[ActorFinding]:
 
 
 def _streams(uses: Sequence[Use], said: Collection[str]) -> Iterator[ActorFinding]:
-    """Find aspects that actors write often and that are durable only by default.
-
-    Args:
-        uses: All requests of the cell.
-        said: Names of the aspects whose durability `cell.toml` sets.
-    """
+    """Find aspects written often that are durable by default alone; `said` are set in the file."""
     told = {use.request.aspect.name for use in uses if use.request.aspect.durability} | set(said)
     for use in uses:
         period_s, aspect = use.actor.period_s, use.request.aspect.name

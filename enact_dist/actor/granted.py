@@ -37,7 +37,6 @@ class RightsFinding(NamedTuple):
     Attributes:
         kind: "rights stale", "right missing" or "right unused".
         actor: The actor concerned, "" where it is not one alone.
-        text: What was found and what to do.
     """
 
     kind: str

@@ -44,7 +44,6 @@ class Group:
     Attributes:
         key: What distinguishes it from others.
         title: Its class.
-        names: Its actors.
         note: When they run, and how often they do if that is known.
         layer: Number of groups that data pass before they reach this one.
     """
@@ -72,11 +71,8 @@ class RequestLine:
 
     Attributes:
         group: Key of the group.
-        name: Name of the request in the class.
         datum: What it names.
-        writes: Whether it may write.
         locks: Whether it holds a lock, which a view does not.
-        triggers: Whether it makes the actor run.
     """
 
     group: str
@@ -111,12 +107,7 @@ class ActorGraph:
 def graph_of(
     actors: Sequence[ActorDeclaration], *, rates_hz: Mapping[str, float] | None = None
 ) -> ActorGraph:
-    """Return the graph of a cell's actors.
-
-    Args:
-        actors: Every actor, as `actor.check` takes them.
-        rates_hz: Updates per second of running actors, by name.
-    """
+    """Return the graph of a cell's actors, with the updates per second of those that run."""
     members: dict[str, list[ActorDeclaration]] = {}
     for actor in actors:
         members.setdefault(_key(actor), []).append(actor)
@@ -234,8 +225,6 @@ class Layout:
         aspects: Box of each datum.
         actors: Box of each group, by its key.
         ends: Both ends of each line, (x, y) at the actor and (x, y) at the aspect.
-        width: Of the whole.
-        height: Of the whole.
     """
 
     worlds: dict[str, Box] = field(default_factory=dict)

@@ -154,12 +154,7 @@ class Inbox(_Box[PendingTriggers]):
 
 
 class SetInbox(_Box[PendingSets]):
-    """`PendingSets` that the watching threads fill and the actor's thread empties.
-
-    Args:
-        sets: The account of the sets, which is empty.
-        views: The members of the set, as they are bound.
-    """
+    """`PendingSets` that the watching threads fill and the actor's thread empties."""
 
     meanwhile = False
 
@@ -252,14 +247,7 @@ def _tell(line: str, count: int | None) -> None:
 
 
 class _Follower:
-    """One watch of an actor, opened again with growing pauses while its shard is away.
-
-    Args:
-        bound: The actor.
-        watched: What it follows, of one world context.
-        inbox: Where changes go.
-        over: Set when the actor ends.
-    """
+    """One watch of an actor, opened again with growing pauses while its shard is away."""
 
     def __init__(
         self,

@@ -81,8 +81,6 @@ class Acted(NamedTuple):
 
     Attributes:
         states: The states of the trigger data that it has seen, as `PendingTriggers.used`.
-        ran: Whether `update` ran.
-        error: What it raised.
     """
 
     states: dict[tuple[int, Entity], tuple[int, int]]

@@ -79,12 +79,6 @@ def outcome_of(
 ) -> Write[Outcome] | None:
     """Return the request of an actor class in which outcomes are written; None without `once`.
 
-    Args:
-        name: Name of the class.
-        once: What it says for `once`.
-        requests: What it declares, by attribute.
-        triggers: What triggers it.
-
     Raises:
         MisuseError: `once` does not go with what the class declares.
     """

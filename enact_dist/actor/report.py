@@ -62,13 +62,7 @@ class Repeated:
         self._kinds: dict[Hashable, _Kind] = {}
 
     def tell(self, kind: Hashable, text: str, now_ns: int) -> int | None:
-        """Return the count to report: 0 for the first, None for not now.
-
-        Args:
-            kind: Counted together; beyond `KINDS_MAX` kinds, all others are, too.
-            text: What happened, for `left`.
-            now_ns: When.
-        """
+        """Return the count to report: 0 for the first, None for not now."""
         known = self._kinds.get(kind)
         if known is None and len(self._kinds) >= KINDS_MAX:
             self._forget_quiet(now_ns)
@@ -126,7 +120,6 @@ class ActorStatistics:
     """What an actor has done so far.
 
     Attributes:
-        name: Name of the running actor.
         state: "starting", "running", "stuck" (its update runs on after its lock was lost), "done"
             (a once-actor that finished) or "stopped".
         updates: Updates that committed.
@@ -200,11 +193,7 @@ _BLANK: Final = dataclasses.asdict(ActorStatistics())
 
 
 class _Newest:
-    """The newest integers of many.
-
-    Args:
-        count_max: How many are kept.
-    """
+    """The newest `count_max` integers of many."""
 
     __slots__ = ("_count", "_ring")
 

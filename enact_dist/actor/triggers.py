@@ -56,11 +56,6 @@ class PendingTriggers:
     def changed(self, source: int, entity: Entity, state: Hashable) -> bool:
         """Take note that a trigger datum of `entity` is in a new state.
 
-        Args:
-            source: Index of the trigger request.
-            entity: Whose datum.
-            state: What distinguishes this state from any other: version and commit stamp.
-
         Returns:
             Whether this was news.
         """
@@ -222,14 +217,10 @@ def tick_before(wall_ns: int, every_s: float) -> int:
 
 
 def is_news(after: Sequence[DatumRead], seen: Mapping[tuple[int, Entity], tuple[int, int]]) -> bool:
-    """Whether a lock that waited for news shows some.
+    """Whether a lock that waited for news after what an actor had seen shows some.
 
     It may show none: it did not wait if the placement changed meanwhile, or if its shard may not
     show a commit of this process yet.
-
-    Args:
-        after: What an actor had seen of each of its triggers.
-        seen: Version and stamp of what the lock shows, by trigger and entity.
     """
     return any(state != after[index][1:] for (index, _), state in seen.items())
 

@@ -36,7 +36,6 @@ class Noun(NamedTuple):
 
     Attributes:
         module: Where its table stands, below `enact_dist.cli`; loaded when the command is used.
-        summary: What the help says of it.
         page: The page of the documents that explains its subject.
     """
 
@@ -170,7 +169,6 @@ class Verb:
 
     Attributes:
         name: Of the verb; of two words (`keys make`) if several verbs share the first one.
-        summary: What the help says of it.
         run: Its function: ``module:name`` beside the noun's table, or ``name`` in that module.
         examples: Command lines, one a line.
         options: Its options and arguments, in the order of the help.
@@ -276,7 +274,6 @@ class Output:
         facts: For programs: `--json` prints them.  What takes long to make may be a function.
         text: For people: lines, or a function that prints them.
         rows: For people: the rows of the verb's table, which stands above the text.
-        status: Exit status.
     """
 
     facts: object

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.cli.arguments import counted, file_of, seconds, seconds_of
@@ -103,12 +102,26 @@ VERBS: Final = (
 
 def run_verify(options: argparse.Namespace) -> int:
     """Run what the options ask for."""
-    chosen = {
-        "chaos.command": options.chaos or options.history is not None,
-        "floods.command": options.floods or options.flood,
-        "frames.command": options.frames,
-        "takeover.command": options.takeover,
-        "recovery": options.recovery,
-    }
-    name = next((name for name, is_asked in chosen.items() if is_asked), "simulation.command")
-    return int(import_module(f"enact_dist.verify.{name}").run(options))
+    if options.chaos or options.history is not None:
+        from enact_dist.verify.chaos import command as chaos
+
+        return chaos.run(options)
+    if options.floods or options.flood:
+        from enact_dist.verify.floods import command as floods
+
+        return floods.run(options)
+    if options.frames:
+        from enact_dist.verify.frames import command as frames
+
+        return frames.run(options)
+    if options.takeover:
+        from enact_dist.verify.takeover import command as takeover
+
+        return takeover.run(options)
+    if options.recovery:
+        from enact_dist.verify import recovery
+
+        return recovery.run(options)
+    from enact_dist.verify.simulation import command
+
+    return command.run(options)

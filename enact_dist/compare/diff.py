@@ -54,9 +54,6 @@ class Comparison:
     """One slot in two world contexts.
 
     Attributes:
-        entity: The entity.
-        aspect: Name of the aspect.
-        kind: How the two sides compare.
         left: The version on the left side; None if it is null.
         right: The version on the right side; None if it is null.
         difference: How far the data are apart; None if a side is null.
@@ -156,15 +153,7 @@ def diff_places(
     *,
     each: bool = False,
 ) -> Diff:
-    """Compare some slots of two world contexts.
-
-    Args:
-        left: One world context.
-        right: The other one.
-        places: The slots: entities (patterns with `each`) and aspects.
-        types: The aspects by name.
-        each: Whether the entities are patterns.
-    """
+    """Compare some slots of two world contexts."""
 
     def compare() -> Diff:
         with both_sides(left, right, places, each=each) as (first, second):
@@ -232,12 +221,6 @@ def compared(
     pairs: Iterable[Pair], first: SideView, second: SideView, types: Mapping[str, Aspect[Any]]
 ) -> Iterator[tuple[Comparison, bool]]:
     """Yield how the two sides of each pair compare, and whether they are one version; in order.
-
-    Args:
-        pairs: Slots of the two views.
-        first: The view of the left side.
-        second: The view of the right side.
-        types: The aspects by name.
 
     Raises:
         LeaseLostError: Data were removed: try again.

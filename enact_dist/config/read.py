@@ -238,10 +238,6 @@ def _check_actors(root: Table, config: CellConfig) -> None:
 def _refuse_misfits(process: ActorProcess, tables: Mapping[str, Table]) -> None:
     """Raise `ConfigError` unless the actors of a process can share it.
 
-    Args:
-        process: One process of the cell.
-        tables: The table of each actor of the cell, by the actor's name.
-
     Raises:
         ConfigError: Two of them differ in their machine or in a variable, or the process is named
             like an actor that runs elsewhere.

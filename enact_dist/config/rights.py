@@ -135,7 +135,6 @@ class RightsConfig:
         groups: Names, or names with stars, of each group.
         programs: Names, beside those of the actors, that rules may mention.
         observe: Who may list sessions, locks, causes and the audit.
-        allow: The rules.
     """
 
     default: Annotated[str, TableKey(choices=DEFAULTS)] = "declared"
@@ -189,12 +188,6 @@ def compiled_rights(
     rights: RightsConfig, path: Path, *, actors: Collection[str], operators: Collection[str]
 ) -> Rights:
     """Return the rights of a cell for its shards.
-
-    Args:
-        rights: Its table `[rights]`.
-        path: Its `cell.toml`.
-        actors: Names of its actors.
-        operators: Who has every right.
 
     Raises:
         ConfigError: `rights.toml` is missing or cannot be read.

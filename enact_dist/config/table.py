@@ -81,10 +81,8 @@ class Field(NamedTuple):
     """A field of a class that describes a table.
 
     Attributes:
-        name: Name of the field.
         kind: Its type, without None.
         required: Whether it has no default.
-        key: Its key.
     """
 
     name: str
@@ -210,11 +208,7 @@ class Table:
         return [Table(item, (*self.where, key, at), self.source) for at, item in enumerate(found)]
 
     def record(self, kind: type[T], **given: object) -> T:
-        """Return the table as an object of a class whose fields are its keys.
-
-        Args:
-            kind: The class.
-            given: Values of fields that are no keys.
+        """Return the table as an object of a class whose fields are its keys, or `given`.
 
         Raises:
             ConfigError: A key is unknown or missing, or its value cannot be used.

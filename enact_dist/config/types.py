@@ -143,7 +143,6 @@ class ShardConfig:
     """One shard daemon.
 
     Attributes:
-        name: Its name in the cell.
         listen: Endpoints it opens (``tcp/0.0.0.0:7447``).
         advertise: Endpoints at which others reach it; those of `listen` unless written.
         folder: Its data folder, absolute, or ``None`` to keep everything in memory.
@@ -192,7 +191,6 @@ class AspectConfig:
     """What the cell fixes about an aspect.
 
     Attributes:
-        name: Name of the aspect.
         durability: What its commits survive, whatever the actors declare; None: as they declare.
         retention: How much of each datum's history stays; None: as the actors declare.
         compare: Comparator for `enact world diff`, ``package.module:NAME``, or nothing.
@@ -216,7 +214,6 @@ class ActorConfig:
     """One actor process.
 
     Attributes:
-        name: Its name in the cell.
         class_path: ``package.module:Class``.
         worlds: Role of the actor class to world context of the cell.
         options: Parameters of the class (`args`), as TOML gives them.

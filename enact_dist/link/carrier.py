@@ -33,11 +33,7 @@ FORKED_REMEDY: Final = (
 
 
 def check_usable(pid: int, *, closed: bool) -> None:
-    """Raise unless a carrier is open and belongs to this process.
-
-    Args:
-        pid: The process that opened it.
-        closed: Whether `close` was called.
+    """Raise unless a carrier is open and belongs to the process `pid`, which opened it.
 
     Raises:
         MisuseError: It is closed or was opened before a fork.
@@ -161,11 +157,7 @@ class Carrier(Protocol):
         """
 
     def subscribe(self, interest: Survey | None = None) -> NoticeFeed:
-        """Open a feed of the notices of all shards, including shards added later.
-
-        Args:
-            interest: What is watched; None for everything.
-        """
+        """Open a feed of the notices of all shards, also of later ones; None: of everything."""
 
     def add_endpoints(self, entries: Sequence[ShardEntry]) -> None:
         """Connect to all further shards that can be reached; existing connections stay.

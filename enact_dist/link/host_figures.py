@@ -30,15 +30,7 @@ _log = logging.getLogger("enact.shard")
 def figures_of(
     state: ShardState, payloads: PayloadDesk, gate: AnswerGate | None, *, parked: int, now_ns: int
 ) -> dict[str, float]:
-    """Return counters and current values, by name.
-
-    Args:
-        state: State of the shard.
-        payloads: The shard's large data.
-        gate: Its lease, in a cell with a store.
-        parked: Number of parked requests.
-        now_ns: This host's monotonic clock.
-    """
+    """Return counters and current values, by name."""
     tenures = list(state.tenures.by_lock.values())
     kept = len(state.tenures.kept.by_number)
     granted = sum(tenure.token is not None for tenure in tenures)
@@ -68,12 +60,7 @@ def latencies_of(state: ShardState, store: StoreThread | None) -> dict[str, Late
 
 
 class Stalls:
-    """Logs when a shard or its disk stalls: its clients only see silence.  For the timer alone.
-
-    Args:
-        shard: The shard's name.
-        count: Called with the name of a counter to add one to.
-    """
+    """Logs when a shard or its disk stalls: its clients only see silence.  For the timer alone."""
 
     def __init__(self, shard: str, count: Callable[[str], None]) -> None:
         self._shard = shard

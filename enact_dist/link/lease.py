@@ -35,11 +35,7 @@ class ShardTakenError(StoreError):
 
 
 class HostLease:
-    """A `Lease` by a clock of this host.  Thread-safe.
-
-    Args:
-        lease_s: Its length.
-        now_s: A clock that goes on while the host is suspended.
+    """A `Lease` by a clock of this host, which goes on while it is suspended.  Thread-safe.
 
     Attributes:
         usable_s: How long it holds after a write was sent.
@@ -148,10 +144,7 @@ class AnswerGate:
     ) -> AnswerGate | None:
         """Return the gate of a store's lease; None: it needs none, for it is held to its end.
 
-        Args:
-            store: The store.
-            count: Called with the name of a counter to add one to.
-            failed: Called once, when the lease cannot be renewed any more.
+        `failed` is called once, when the lease cannot be renewed any more.
         """
         holding = store.holding if store is not None else None
         if holding is None:

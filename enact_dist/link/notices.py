@@ -44,11 +44,7 @@ class Skipped(NamedTuple):
 
 
 class Interest:
-    """The slots that a watcher wants.  Used by one thread at a time.
-
-    Args:
-        wanted: The listing of all these slots.
-    """
+    """The slots that a watcher wants.  Used by one thread at a time."""
 
     __slots__ = ("_aspects", "_contexts", "_entities", "_known", "wanted")
 

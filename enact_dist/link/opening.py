@@ -36,13 +36,8 @@ def open_host(
 ) -> ShardHost:
     """Open a shard's place and run the shard; without a place no data outlive the process.
 
-    Args:
-        settings: The settings of the shard.
-        place: Its folder, or the shard in a database that was found free.
-        clock: See `ShardHost`, as for all that follow.
-        on_failure: See there.
-        shared: See there.
-        payload_bytes_max: See there.
+    The place is a folder, or the shard in a database that was found free; see `ShardHost` for the
+    other arguments.
 
     Raises:
         StoreError: The place is in use, unreadable or corrupt, or holds entities of other shards.

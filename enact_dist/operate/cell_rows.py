@@ -17,8 +17,6 @@ class ShardRates:
     """One shard.  Rates are None before there are two looks at it.
 
     Attributes:
-        name: Its name.
-        endpoint: Where it is.
         state: "open", "waits for older leases", "drains", or "AWAY".
         away_s: Since how long it does not answer; 0 if it does.
         problem: Why it is not reachable, if that is known.
@@ -35,7 +33,6 @@ class ShardRates:
         locks_waiting: Locks awaited now.
         shared_bytes: Large data in shared memory.
         shared_bytes_max: The limit of these; 0: it has no shared folder.
-        sessions: Sessions of clients.
         leases: How many named sessions have how much of their lease left; by bounds.
         slots: Slots stored, null ones included.
         data_bytes: Size of the newest data.
@@ -70,11 +67,8 @@ class CounterRates:
     """One counter of a shard that has moved since the first look.
 
     Attributes:
-        shard: The shard.
-        name: Of the counter.
         hz: How much it moves per second now; None before there are two looks.
         moved: By how much it has moved since the first look.
-        total: Its value.
         meaning: What it counts.
         remedy: What to do if it grows; empty if growth is normal.
     """
@@ -93,9 +87,6 @@ class ActorRates:
     """One actor, as it reports itself.
 
     Attributes:
-        name: Its name.
-        host: Where it runs.
-        pid: Its process there.
         state: As it reports; "silent" if its lease is over, "connected" if it reports nothing,
             "away" if all shards that know it are: then all else is what was last known.
         runs_hz: Updates per second, over its last 5 s; None of one that is silent or away.
@@ -112,7 +103,6 @@ class ActorRates:
         restarts: How often it began anew since the first look.
         lease_left_s: Rest of its session's lease.
         locks: Locks that its session holds or awaits.
-        last_error: The newest error.
     """
 
     name: str
@@ -140,9 +130,6 @@ class DatumRates:
     """One slot.
 
     Attributes:
-        world: Its world context.
-        entity: Its entity.
-        aspect: Its aspect.
         version: Of the newest datum.
         hz: Versions per second; None before there are two looks at it.
         size_bytes: Size of the newest datum's body.
@@ -176,7 +163,6 @@ class CellRates:
         took_s: How long the second one took, its slots left out.
         shards: All shards, those away too.
         counters: The counters that have moved, those with a remedy first.
-        actors: The actors, by name.
         locks: Locks held, awaited and kept.
         data: The slots, as of the newest look that asked for them; those of a shard that did not
             list them then as of the one before.

@@ -64,12 +64,7 @@ SHM_BYTES_WARN: Final = 256_000_000
 
 
 def examine(target: str, *, timeout_s: float = 5.0) -> Iterator[Finding]:
-    """Check this machine and, unless `target` is empty, the cell.
-
-    Args:
-        target: A `cell.toml`, an endpoint, or the empty string.
-        timeout_s: How long to wait for a shard.
-    """
+    """Check this machine and, unless `target` is empty, the cell."""
     yield python_version(sys.version_info[:3])
     yield from _packages()
     yield from _open3d()

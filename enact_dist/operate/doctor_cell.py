@@ -51,8 +51,6 @@ class Finding:
 
     Attributes:
         level: How grave it is.
-        subject: What was checked.
-        text: What was found.
         remedy: What to do; empty where nothing has to be done.
     """
 
@@ -80,13 +78,7 @@ def fail(subject: str, text: str, remedy: str = "") -> Finding:
 def differences(
     config: CellConfig | None, shards: Iterable[ShardInfo], welcomes: Mapping[str, Welcome]
 ) -> Iterator[Finding]:
-    """Name what the running shards say otherwise than each other, or than the file.
-
-    Args:
-        config: The file; None: there is none.
-        shards: The shards of the running cell.
-        welcomes: The answers about the cell.
-    """
+    """Name what the running shards say otherwise than each other, or than the file."""
     placements = {name: welcome.placement for name, welcome in welcomes.items()}
     versions = {placement.version: name for name, placement in placements.items()}
     if len(versions) > 1:
@@ -121,11 +113,6 @@ def duplicate_daemons(
 ) -> Iterator[Finding]:
     """Name the shards that several daemons serve, at any endpoint known of them.
 
-    Args:
-        cell: The cell's name.
-        config: The file; None where there is none.
-        welcomes: The answers about the cell.
-
     Each shard is asked, too, at which further places others have named it.
     """
     from enact_dist.config.environment import security_of
@@ -153,12 +140,7 @@ def duplicate_daemons(
 
 
 def folders(config: CellConfig, kept: Collection[str]) -> Iterator[Finding]:
-    """Check the disks of the shards that run, or may run, on this host.
-
-    Args:
-        config: The file.
-        kept: The shards that run and keep data in a folder, wherever that is.
-    """
+    """Check the disks of the shards that run with a folder, or may run, on this host."""
     host = socket.gethostname()
     for shard in config.shards:
         folder, running = shard.folder, shard.name in kept

@@ -55,7 +55,6 @@ class Task:
     Attributes:
         name: How the log names it.
         kind: "shard" or "actor"; decides the order of start and end.
-        command: What to run.
         drain_s: How long it may wait for others before it ends.
         env: Environment variables that it has beside those of the supervisor.
     """

@@ -32,11 +32,7 @@ class _Entry(NamedTuple):
 
 
 class DiskThread:
-    """Writes commits into a file in the order in which they come.
-
-    Args:
-        file: The file; used by this thread only until `close` has returned.
-        bytes_max: How much may wait.
+    """Writes commits into a file in the order in which they come; at most `bytes_max` wait.
 
     Attributes:
         waited_s: How long `put` has waited for room, in all.

@@ -82,16 +82,12 @@ class Recorded:
     """One version of one slot in a recording.
 
     Attributes:
-        slot: Which slot.
-        version: Which version.
         stamp_ns: Stamp of its commit.
         shard: Where it was committed.
         commit: Number of the commit in the recording, from 1; 0: was there when it began.
         datum: The datum, with its capture stamp; None for null.
         null_reason: Why it is null, a name of `NullReason`; "" for a datum.
         actor: Who committed it, "" where that is not known.
-        host: Where that one ran.
-        pid: As which process.
         kind: How it was made, "commit" or "fork"; "" where that is not known.
         held_ns: How long its lock had been held when it committed.
         reads: What the lock had read.

@@ -31,7 +31,6 @@ class ExportSummary:
     """What an export holds.
 
     Attributes:
-        path: The file.
         at_ns: The timestamp of the exported state.
         versions: Data in it.
         size_bytes: Bytes on the disk.

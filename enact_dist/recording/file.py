@@ -111,10 +111,6 @@ class RecordingFile:
     def add_commit(self, versions: Sequence[Recorded], log_ns: int) -> None:
         """Write the data of one commit.
 
-        Args:
-            versions: All recorded versions of the commit.
-            log_ns: Its log time in the file.
-
         Raises:
             OSError: The disk refuses.
         """

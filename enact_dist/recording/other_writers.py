@@ -35,9 +35,6 @@ _log = logging.getLogger("enact.recording")
 class OtherWriters:
     """Slots with other writers; reported before the first commit, and once when they write.
 
-    Args:
-        warn: Takes each warning.
-
     Attributes:
         found: Who else writes a slot, by its name; declared, or seen to have done so.
     """

@@ -45,7 +45,6 @@ class ReplaySummary:
     """What a replay has done.
 
     Attributes:
-        path: The recording.
         seconds: How long it took.
         commits: Commits made; what was there at the recording's begin does not count as one.
         versions: Data set, nulls too.

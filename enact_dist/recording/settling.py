@@ -74,12 +74,7 @@ class Settling:
                 time.sleep(ASK_S)  # the address of a shard that is away refuses at once
 
     def _all_show(self, stamp_ns: int, *, absent: bool = True) -> bool:
-        """Whether every shard shows all that is committed up to a stamp.
-
-        Args:
-            stamp_ns: The stamp.
-            absent: What counts for a shard that does not answer.
-        """
+        """Whether every shard shows all up to a stamp; one that does not answer: `absent`."""
         session, wait_ns = self._client.core.session, int(ASK_S * 1e9)
         try:
             answers = self._client.ask_each(

@@ -18,7 +18,6 @@ class RecordingSummary:
     """What a recording holds, and what it does not.
 
     Attributes:
-        path: The file.
         seconds: How long it was recorded.
         commits: Commits in it, whole; the initial data do not count as one.
         versions: Versions in it.

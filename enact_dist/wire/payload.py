@@ -52,10 +52,8 @@ class Encoded:
     """A value on its way into a datum: its bytes still lie where they were.
 
     Attributes:
-        encoding: Of the datum.
         parts: Buffers, which make up the body one after another.
         size: Length of the body in bytes.
-        stamp_ns: Of the datum.
     """
 
     encoding: bytes

@@ -72,13 +72,7 @@ def quick_reader_of(cls: type[Any], judge: Read, *, printable: bool = False) -> 
 
 
 class _Code:
-    """The source of one reader, as far as it is written.
-
-    Args:
-        names: What the source refers to.
-        lines: The source, a line each.
-        printable: Whether the judge decides on each text that cannot be printed.
-    """
+    """The source of one reader, as far as it is written."""
 
     def __init__(self, names: dict[str, Any], lines: list[str], *, printable: bool) -> None:
         self._names = names

@@ -72,11 +72,7 @@ def reports_of(cell: Cell, name: str) -> list[tuple[ActorInfo, dict[str, Any]]]:
 def send_to(cell: Cell, info: ActorInfo, row: dict[str, Any], command: dict[str, Any]) -> str:
     """Give a command to an actor that reports; return the token that its answer begins with.
 
-    Args:
-        cell: Where it runs.
-        info: Its session.
-        row: Its report, which names the world context in which it reads commands.
-        command: The command: `{"set": values}` or `{"restart": True}`.
+    The command is `{"set": values}` or `{"restart": True}`.
 
     Raises:
         EnactError: The lock was not granted, or its commit failed.
@@ -110,14 +106,7 @@ def set_attributes(actor: Actor, values: dict[str, str]) -> None:
 
 
 class CommandListener:
-    """Listens for commands to one actor of this process, in a thread; a context manager.
-
-    Args:
-        actor: The actor.
-        run: Its run.
-        cell: Where it runs.
-        restart: Called to restart it.
-    """
+    """Listens for commands to one actor of this process, in a thread; a context manager."""
 
     def __init__(
         self, actor: Actor, run: ActorRun, cell: Cell, restart: Callable[[], object]

@@ -38,8 +38,6 @@ class MethodCall:
         method: "start", "update" or "stop".
         about: " for ENTITY", or nothing.
         since_ns: When it began, by the monotonic clock.
-        thread: Which thread is in it.
-        lock: The lock that it runs under, if it runs under one.
         remains: What becomes of its result if the process is ended now.
     """
 

@@ -107,9 +107,6 @@ class Step:
         MisuseError: There is no such version yet, or it is not known which commit made it.
         UnknownWorldError: The cell has no world context of that name.
         ShardUnreachableError: A shard does not answer.
-
-    Attributes:
-        made: The version.
     """
 
     def __init__(self, cell: Cell, world: str, entity: str, aspect: str, version: int = 0) -> None:

@@ -37,10 +37,6 @@ class LearnedRefusal:
 
     Attributes:
         identity: Whose rights the requests used.
-        right: The right that was missing.
-        what: On what.
-        count: How often it was refused.
-        last_s: When last, seconds since 1970.
     """
 
     identity: str
@@ -106,12 +102,7 @@ class Learner:
         return [self._learned[key] for key in sorted(self._learned)]
 
     def look(self, cell: Cell, *, counts: bool = True) -> list[LearnedRefusal]:
-        """Ask each shard; return what was refused for the first time.
-
-        Args:
-            cell: Where to ask.
-            counts: Whether what is new to this object has been refused in its time.
-        """
+        """Ask each shard; return what is refused for the first time; nothing unless `counts`."""
         found = []
         for shard in self._shards:
             try:
@@ -150,9 +141,7 @@ class Learner:
 def rule_lines(learned: Iterable[LearnedRefusal], known: Iterable[str]) -> Iterator[str]:
     """Yield the lines of `cell.toml` that give what was refused; comments where no rule can.
 
-    Args:
-        learned: What was refused, sorted by identity.
-        known: The names that rules may mention.
+    `learned` is sorted by identity; rules may mention the `known` names.
     """
     by_identity: dict[str, list[LearnedRefusal]] = {}
     for one in learned:

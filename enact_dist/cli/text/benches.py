@@ -9,7 +9,6 @@ class Told(NamedTuple):
     """What `--help` says of a bench.
 
     Attributes:
-        what: What it measures.
         alone: Whether it can be `--embedded`: within one process.
         guest: Whether it can `--connect` to a cell that runs.
         minutes: Whether it takes more than a minute with the measuring time that is usual.

@@ -24,9 +24,7 @@ class Sample(NamedTuple):
     """One change of a slot.
 
     Attributes:
-        stamp_ns: Of its commit.
         missed: Versions before it that the watch did not see.
-        size_bytes: Of its datum.
         captured_ns: When the datum was captured, 0 where its writer did not say.
     """
 

@@ -28,10 +28,7 @@ COMPARED_MAX: Final = 1000
 def slots_output(title: str, infos: Sequence[SlotInfo], *, at_ns: int | None = None) -> Output:
     """Return slots as a tree of their entities, aspects as its leaves; for programs, as a list.
 
-    Args:
-        title: Name of the world context.
-        infos: The slots.
-        at_ns: The moment that their ages count to; None: now.
+    Ages count to the moment `at_ns`; None: to now.
     """
     root = Branch(f"{title} ({len(infos)} data)")
     for info in infos:
@@ -78,10 +75,6 @@ def datum_output(datum: object, *, out: str | None) -> Output | int:
 @contextmanager
 def named_if_missing(world: WorldContext | PastContext, slot: tuple[str, str]) -> Iterator[None]:
     """Report a null datum in the terms of the command line.
-
-    Args:
-        world: Its world context, present or past.
-        slot: Its entity and aspect.
 
     Raises:
         NullDatumError: It is null.

@@ -33,13 +33,7 @@ EVENTS_SHOWN: Final = 3
 
 
 class TopApp(App[None]):
-    """Shows a cell until `q`.
-
-    Args:
-        cell: Name of the cell.
-        look: Takes a look at the cell; called from a thread of its own.
-        every_s: Time between two looks.
-    """
+    """Shows a cell until `q`."""
 
     TITLE = "enact top"
     ENABLE_COMMAND_PALETTE = False

@@ -21,7 +21,6 @@ class TopColumn(NamedTuple):
     """One column.
 
     Attributes:
-        name: Its heading.
         text: What it shows of a row.
         value: What a row is sorted by; None comes last.
         falls: Whether large values come first.
@@ -40,7 +39,6 @@ class TopTable:
     Attributes:
         key: The key that shows it alone.
         title: What it holds.
-        columns: Its columns.
         rows: Its rows in what two looks have shown.
         first: The column that it is sorted by, at first.
         empty: What stands in place of no rows.

@@ -31,13 +31,7 @@ An idle one has nothing to lose: its shards forget it only after several TTLs wi
 
 
 class Backoff:
-    """Pauses that double up to a longest one, each shortened by up to a half at random.
-
-    Args:
-        first_ns: The first pause.
-        longest_ns: The longest one.
-        draw: Returns numbers in [0, 1).
-    """
+    """Pauses that double up to a longest one, each shortened by up to a half at random."""
 
     __slots__ = ("_draw", "_longest_ns", "_next_ns")
 
@@ -74,13 +68,7 @@ class SignsOfLife:
         self._used_until_ns = 0
 
     def due(self, shards: Iterable[str], away: Callable[[str], bool], now_ns: int) -> list[str]:
-        """Return the shards that are to be asked now.
-
-        Args:
-            shards: All that know the session.
-            away: Whether a shard is known to be out of reach.
-            now_ns: The session's clock.
-        """
+        """Return the shards that are to be asked now, of all that know the session."""
         shards = list(shards)
         gone = frozenset(shard for shard in shards if away(shard))
         if gone - self.gone:

@@ -138,13 +138,7 @@ class Keeping:
         return now_ns - self.begun_ns if self.begun_ns else 0
 
     def ends(self, phase: Phase, part: Part, *, sent: bool) -> bool:
-        """Take in how the lock ends; return whether nothing is left to report to the shard.
-
-        Args:
-            phase: In which the lock rests.
-            part: What it held.
-            sent: Whether its end was begun by messages.
-        """
+        """Take in how the lock ends; return whether nothing is left to report to the shard."""
         if self.grant is not None:
             self.grant.until_ns = max(self.grant.until_ns, part.until_ns)
         if self.grant is None or phase is Phase.COMMITTED:

@@ -28,8 +28,6 @@ class Going(NamedTuple):
     """What one shard has of one aspect.
 
     Attributes:
-        shard: Its name.
-        aspect: That of the aspect.
         type: Fingerprint of its registered type, "" if it is not registered.
         slots: How many slots of it there are.
         versions: How many states these have, replaced ones included.

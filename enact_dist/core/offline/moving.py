@@ -47,7 +47,6 @@ class Move(NamedTuple):
     """The move of one entity.
 
     Attributes:
-        entity: Its name.
         source: The shard that deletes it.
         target: The shard that it belongs to.
         states: How many states of its slots there are, replaced ones included.

@@ -93,12 +93,7 @@ def wrong_label(label: str) -> Refused | None:
 
 
 def wrong_commit(message: Commit | Prepare, *, peers: Collection[str]) -> Refused | None:
-    """Refuse writes, parties or a lineage that no honest client names (see the functions below).
-
-    Args:
-        message: A commit or prepare.
-        peers: The other shards of the cell.
-    """
+    """Refuse writes, parties or a lineage that no honest client names (see the functions below)."""
     alone = type(message) is Commit and not message.participants
     if alone and len(message.writes) == 1 and not message.reads and not message.reads_left_out:
         return None  # the usual case
@@ -143,12 +138,7 @@ def missing_payload(writes: Iterable[WriteItem]) -> Refused | None:
 
 
 def wrong_parties(message: Commit | Prepare, *, peers: Collection[str]) -> Refused | None:
-    """Refuse a commit over shards with an unreachable participant, or with this shard itself.
-
-    Args:
-        message: A commit with its participants, or a prepare with its primary.
-        peers: The other shards of the cell.
-    """
+    """Refuse a commit over shards with an unreachable participant, or with this shard itself."""
     for shard in message.participants if isinstance(message, Commit) else (message.primary,):
         if shard not in peers:
             known = ", ".join(sorted(peers)) or "none"

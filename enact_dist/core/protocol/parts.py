@@ -126,8 +126,6 @@ class Cause(NamedTuple):
         lock: The lock that committed it; over several shards all causes of a commit name the same.
         kind: One of `CAUSE_*`.
         actor: Name of the session, "" if it has none.
-        host: Its host.
-        pid: Its process.
         stamp_ns: Stamp of the commit.
         held_ns: How long the lock had been held when its commit, or its promise, reached the shard.
         reads: Every datum that the lock read or viewed; of a pattern, and of replaced data, those

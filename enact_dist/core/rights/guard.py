@@ -112,12 +112,7 @@ class Guard:
     # ---------------------------------------------------------------- requests
 
     def refusal(self, message: object, worlds: Collection[str]) -> Refused | None:
-        """Return why the present subject may not ask that, else None.
-
-        Args:
-            message: A request, or an event of the host, which needs no right.
-            worlds: The world contexts that exist.
-        """
+        """Return why the present subject may not ask that, else None; events of the host may."""
         kind = type(message)
         if kind is Commit:
             return None  # compared behind its fence
@@ -188,12 +183,7 @@ class Guard:
         return self.denied("read", shown(slot)) if self.hides(slot) else None
 
     def may_not_write(self, writes: Iterable[WriteItem], contents: SlotContents) -> Refused | None:
-        """Refuse writes for which the present subject has not the right.
-
-        Args:
-            writes: What it writes.
-            contents: What the slots have now.
-        """
+        """Refuse writes for which the present subject has not the right."""
         for slot, datum in writes:
             right = "delete" if datum is None else "change"
             if datum is not None and contents[slot].datum is None:

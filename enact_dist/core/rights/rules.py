@@ -220,14 +220,7 @@ class Rights:
         return self.users.get(user) or (own if own in self.operators else "")
 
     def refuse(self, subject: str, asker: str, right: str, what: str) -> Refused:
-        """Refuse a request.
-
-        Args:
-            subject: Whose rights it would have used.
-            asker: The identity under which it came.
-            right: Which one it lacks.
-            what: On what, for people.
-        """
+        """Refuse a request of `asker` that would have used the rights of `subject`."""
         on = f" {what}" if what else ""
         if subject == UNPROVEN:
             return Refused(

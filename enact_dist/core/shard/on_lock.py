@@ -231,13 +231,7 @@ class LockDesk:
     def refused(
         self, map_version: int, items: tuple[Item, ...], shape: Shape | None
     ) -> Answer | None:
-        """Return why this shard cannot grant these items, None if it can.
-
-        Args:
-            map_version: The placement that the client knows.
-            items: What it asks for.
-            shape: What is remembered of these items, if anything is.
-        """
+        """Return why this shard cannot grant these items, None if it can."""
         state = self._state
         if map_version != state.settings.placement.version:
             state.count("wrong_shard")

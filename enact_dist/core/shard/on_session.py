@@ -126,12 +126,8 @@ class SessionDesk:
     ) -> Iterator[Effect]:
         """Answer when `records` are kept, and all before them that the answer may tell of.
 
-        Args:
-            reply_to: Where the answer goes.
-            answer: The answer.
-            records: What is to be kept first; nothing: what an earlier answer waits for.
-            durability: What the records must survive.
-            session: The session that is durable with its record.
+        Without records it waits for what an earlier answer waits for.  `session` is durable with
+        its record.
         """
         reply = Reply(reply_to, answer)
         if records:

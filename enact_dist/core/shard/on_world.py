@@ -76,7 +76,6 @@ class _Act:
     """A fork or a drop that is not answered yet.
 
     Attributes:
-        message: What was asked.
         asked: By whom: each request for it, and where its answer goes.
         wait_end_ns: When a fork has waited enough.
         made: The slots of a fork that the store works on.

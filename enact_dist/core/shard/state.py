@@ -64,7 +64,6 @@ class ShardSettings:
     """What a shard learns from the configuration of its cell.
 
     Attributes:
-        name: The shard's name.
         placement: All shards of the cell; the shard itself is one of them.
         worlds: World contexts that exist from the start.
         aspects: Aspects whose durability the cell decides; their fingerprints may be empty.

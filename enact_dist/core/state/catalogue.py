@@ -245,12 +245,7 @@ class Catalogue:
             self._shown = None
 
     def newer_type(self, aspect: str, known_successions: int) -> AspectEntry | None:
-        """Return the entry of an aspect that a client may know with an older type.
-
-        Args:
-            aspect: Name of the aspect.
-            known_successions: How many successions of types, of all aspects, the client knows.
-        """
+        """Return the entry of an aspect that a client may know with an older type."""
         if known_successions == self.successions:
             return None
         entry = self.aspects.get(aspect)

@@ -349,13 +349,7 @@ class History:
         return found is not None and old.version in found.kept
 
     def keep(self, label: str, version: SlotVersion, newest: Content) -> bool:
-        """Keep a version under a label; False where it is forgotten.
-
-        Args:
-            label: The label.
-            version: Which version.
-            newest: The newest state of its slot.
-        """
+        """Keep a version under a label; False where it is forgotten."""
         slot, number = version
         found = self._by_slot.get(slot)
         is_newest = 0 < newest.version == number

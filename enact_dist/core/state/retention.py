@@ -227,13 +227,7 @@ class PayloadNames:
         self.spare = 0
 
     def count(self, datum: Datum | None, *, stays: int = 0, may_go: int = 0) -> None:
-        """Count that more (or fewer) states name a datum's payload.
-
-        Args:
-            datum: The datum; nothing to be done where it is no payload.
-            stays: So many more are newest states or kept ones.
-            may_go: So many more are replaced states.
-        """
+        """Count that more (or fewer) states, kept ones and replaced ones, name a payload."""
         if datum is None or not datum.file:
             return
         before, going = self._named.get(datum.file, (0, 0))

@@ -30,11 +30,6 @@ _PACKAGE: Final = "enact_dist."
 def when_dropped(client: CellClient, name: str, host: Any) -> weakref.finalize[Any, Any]:
     """End a session, and the shard inside this process, once nothing refers to it any more.
 
-    Args:
-        client: The session.
-        name: The cell's name.
-        host: The shard inside this process; None: there is none.
-
     Returns:
         A finalizer whose `detach` cancels this.
     """

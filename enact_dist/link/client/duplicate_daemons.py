@@ -38,7 +38,6 @@ class Serving:
     Attributes:
         endpoint: Where it answers.
         start: The random number of its start.
-        epoch: Its current epoch.
         uptime_s: Time since its start.
     """
 

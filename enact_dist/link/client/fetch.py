@@ -160,13 +160,7 @@ def _at_hand(client: CellClient, cache: DatumCache, reading: Reading) -> Datum |
 
 
 class _Incoming:
-    """One datum that arrives in slices, and their destinations.
-
-    Attributes:
-        reading: Identifies it.
-        state: Its state.
-        count: Number of slices.
-    """
+    """One datum that arrives in slices, and their destinations."""
 
     def __init__(self, lock: LockId, reading: Reading, slice_bytes: int) -> None:
         self.reading = reading

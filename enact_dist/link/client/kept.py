@@ -40,15 +40,7 @@ class WantedLock(NamedTuple):
 
 
 class KeptUses:
-    """What touches the pages of marks when locks of one session begin and end.
-
-    Args:
-        core: The session.
-        payloads: Has the pages.
-        mutex: Guards the session.
-        now_ns: The session's clock.
-        counters: Those of the session.
-    """
+    """What touches the pages of marks when locks of one session begin and end."""
 
     def __init__(
         self,

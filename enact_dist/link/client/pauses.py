@@ -120,13 +120,6 @@ def keep_renewing(found: weakref.ref[Renewed], pauses: Pauses) -> None:
 class Renewal:
     """When one session sends keep-alives, and to which shards.  Thread-safe.
 
-    Args:
-        core: The session.
-        carrier: Tells which shards are away.
-        mutex: Guards the session.
-        pauses: Where the keep-alive thread pauses.
-        now_ns: The session's clock.
-
     Attributes:
         used_until_ns: Until then the last note of a use counts for further ones.
     """

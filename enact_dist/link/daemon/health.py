@@ -28,7 +28,6 @@ class ShardHealth:
     """The health of one shard.
 
     Attributes:
-        name: Its name.
         alive: It answers.
         ready: It answers and grants locks.
         state: "open", "waits for older leases", "drains" or "unreachable".

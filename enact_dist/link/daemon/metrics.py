@@ -54,11 +54,7 @@ _log = logging.getLogger("enact.link")
 
 
 class Pulse:
-    """Whether something has happened lately.  Thread-safe.
-
-    Args:
-        for_s: How long one beat counts.
-    """
+    """Whether something has happened in the last `for_s`.  Thread-safe."""
 
     def __init__(self, for_s: float) -> None:
         self._for_s = for_s
@@ -78,7 +74,6 @@ class MetricsSource:
     """What a server of metrics shows; called from its threads.
 
     Attributes:
-        page: Returns the metrics.
         alive: Whether the process does its work.
         ready: Whether the shard serves, or stands by and sees its database.
         count: Called with "metrics_readers_refused" for each refused reader.
@@ -241,12 +236,7 @@ def source_of(host: ShardHost, cell: str) -> MetricsSource:
 
 
 class StandbyProbes:
-    """What a daemon shows while it stands by, and while it reads the shard that it has taken over.
-
-    Args:
-        settings: The settings of its shard, with an address for metrics.
-        figures: Returns what it has counted, by name.
-    """
+    """What a daemon shows while it stands by, and while it reads a shard that it has taken over."""
 
     def __init__(self, settings: DaemonSettings, figures: Callable[[], dict[str, int]]) -> None:
         self._alive, self._sees = Pulse(ALIVE_S), Pulse(SEES_S)

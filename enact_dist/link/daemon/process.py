@@ -127,9 +127,6 @@ def _started(
 class WaitingShard:
     """The endpoints of a daemon that waits for its shard: clients connect before it serves.
 
-    Args:
-        settings: The settings of the shard.
-
     Attributes:
         settings: With keys, names and rights as they were taken last.
         certificate: The one that it shows, in a cell with keys.

@@ -29,10 +29,6 @@ def refuse_second_daemon(settings: DaemonSettings, *, probe_s: float | None = No
     Other running shards of the cell are asked where they expect it.  Two daemons may be there for a
     shard in a database, which lets one of them serve.
 
-    Args:
-        settings: Settings of the shard.
-        probe_s: How long a listener there may take to identify itself; None: `PROBE_S`.
-
     Raises:
         LinkError: A daemon does, or another shard of the cell runs twice.
         ConfigError: An endpoint cannot be read.

@@ -28,7 +28,6 @@ class DaemonSettings:
     """The settings of a shard daemon.
 
     Attributes:
-        cell: Name of the cell.
         shard: The settings of the shard, with its name and the endpoints for clients.
         listen: Endpoints to listen at ("tcp/0.0.0.0:7447").
         folder: Its data folder; None keeps data in memory only.

@@ -58,9 +58,6 @@ class ShardCalls:
         returned: Called from any thread with the name of each previously called shard that comes
             (back) within reach.
         keys: The files by which this shard proves its name, in a cell with keys.
-
-    Attributes:
-        keys: As given.
     """
 
     def __init__(

@@ -193,12 +193,7 @@ def check_log(folder: Path, *, power_cut: bool) -> None:
 
 
 def check_reach(folder: Path, found: FolderFindings, *, batch: int) -> None:
-    """Refuse a database that ends before the batch in the mark.
-
-    Args:
-        folder: The data folder.
-        found: The findings of `look_at`.
-        batch: Number of the newest batch that was read.
+    """Refuse a database whose newest batch comes before the one in the mark.
 
     Raises:
         StoreError: Acknowledged batches are missing.

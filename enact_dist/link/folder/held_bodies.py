@@ -41,10 +41,6 @@ def hold(blobs: Path, held: Path) -> None:
 def held_bodies(folder: Path, into: Path) -> Iterator[Path]:
     """Yield a folder for links that preserve the bodies of a shard's folder; remove it at the end.
 
-    Args:
-        folder: The shard's folder.
-        into: Destination of the backup.
-
     Raises:
         StoreError: Another backup of this folder is in progress.
         OSError: As the system reports it.

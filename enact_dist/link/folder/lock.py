@@ -47,10 +47,7 @@ def file_mode(folder: Path) -> int:
 
 
 class FolderLock:
-    """The exclusive lock on a data folder, held from construction to `close`.
-
-    Args:
-        folder: An existing folder.
+    """The exclusive lock on an existing data folder, held from construction to `close`.
 
     Raises:
         StoreError: Another process holds it, or the lock file cannot be made.
@@ -150,10 +147,6 @@ def replace_file(path: Path, content: bytes, *, mode: int | None = None) -> None
 
 def check_format(folder: Path, *, is_new: bool) -> None:
     """Refuse a folder of another format; mark a new or compatible one with ours.
-
-    Args:
-        folder: The data folder, locked.
-        is_new: Whether nothing has been stored in it yet.
 
     Raises:
         StoreError: The format is newer or older, unreadable, or missing in a folder with data.

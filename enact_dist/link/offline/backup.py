@@ -78,12 +78,9 @@ class Backup:
     """The description of a backup.
 
     Attributes:
-        cell: Name of the cell.
-        shard: Name of the shard.
         unix_s: When it began, seconds since 1970; it holds everything acknowledged by then.
         epoch: The shard's epoch then.
-        entities: How many entities it has.
-        states: How many states of their slots, replaced ones included.
+        states: How many states of its slots, replaced ones included.
         size: Bytes of their data.
         digests: Whether it has digests of its files; backups of older releases have none.
     """
@@ -270,7 +267,6 @@ class Manifest(NamedTuple):
     """The contents of a backup's description.
 
     Attributes:
-        backup: The backup itself.
         files: Digests of its files; None: it is from before backups had digests.
         modes: Permissions of the restored files; empty: it is from before backups recorded them.
     """

@@ -89,7 +89,6 @@ class ErasedShard(NamedTuple):
     """What a database had of a shard.
 
     Attributes:
-        shard: Its name.
         epoch: Its last epoch.
         batch: Number of its newest batch.
         rows: How many rows of data it had.
@@ -260,12 +259,7 @@ def shards_in_database(cell: StoreAddress) -> list[str]:
 def erase_database(
     cell: StoreAddress, only: Collection[str] = (), *, dry_run: bool = False
 ) -> list[ErasedShard]:
-    """Delete all that a database has of shards; all or none.
-
-    Args:
-        cell: The database and the cell; the shard does not matter.
-        only: The shards; empty: all that the database has of the cell.
-        dry_run: Whether to change nothing.
+    """Delete all that a database has of shards, or of all its shards of the cell; all or none.
 
     Raises:
         StoreError: A daemon serves one, there is no such shard, or the database cannot be used.

@@ -68,12 +68,6 @@ def look(
 ) -> Purged:
     """Return what `forget` would purge; change nothing.
 
-    Args:
-        folders: The folder of each shard.
-        aspects: Names of the aspects.
-        unused: As for `forget`.
-        progress: Receives what would be purged.
-
     Raises:
         StoreError: As `forget`.
         MisuseError: As `forget`.

@@ -73,11 +73,8 @@ class CopiedStore(NamedTuple):
     """What was copied.
 
     Attributes:
-        entities: How many entities the shard has.
-        states: How many states of their slots, replaced ones included.
-        rows: How many rows of the store.
-        bodies: How many large bodies.
-        size: Bytes of those bodies.
+        states: How many states of its slots, replaced ones included.
+        size: Bytes of the large bodies.
         batch: Number of the newest batch.
         epoch: The next start begins above this epoch.
     """

@@ -24,8 +24,6 @@ class StoreAddress:
 
     Attributes:
         url: The database, with one host or several, as libpq reads it.
-        cell: Name of the cell.
-        shard: Name of the shard.
         lease_s: How long its daemon may answer after its last confirmed write, seconds.
     """
 
@@ -44,7 +42,6 @@ class FreeShard:
     """A shard that no process held when it was last seen.
 
     Attributes:
-        address: Its place.
         seen: Its row.
         rows: What was read ahead of it, for this takeover or the next try; None: nothing.
         stopped: Breaks the takeover off.

@@ -46,14 +46,7 @@ _AT_ONCE: Final = 500 if psycopg.capabilities.has_stream_chunked() else 1
 
 
 class RowReader:
-    """Reads rows of a shard over one connection.
-
-    Args:
-        session: The connection.
-        shard: Number of the shard.
-        name: Its place, for people.
-        stopped: Ends each read, with what was read so far.
-    """
+    """Reads rows of a shard over one connection, until `stopped` is set."""
 
     def __init__(
         self, session: DatabaseSession, shard: int, name: str, stopped: threading.Event
@@ -118,12 +111,7 @@ def streamed(
 
 
 class ReadAhead:
-    """Keeps the rows of a shard in memory, on a thread and a connection of its own.
-
-    Args:
-        address: The shard.
-        rows: What was read of it before.
-    """
+    """Keeps the rows of a shard in memory, on a thread and a connection of its own."""
 
     def __init__(self, address: StoreAddress, rows: Rows | None = None) -> None:
         self._address = address

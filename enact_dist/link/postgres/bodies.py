@@ -59,12 +59,7 @@ class BodiesToWrite:
 
 
 class ReadBodies:
-    """The bodies of a shard, as read.
-
-    Args:
-        place: Where they are, for people.
-        rows: Name and data of each part, in order.
-    """
+    """The bodies of a shard, as read."""
 
     def __init__(self, place: str, rows: Iterable[tuple[str, bytes]]) -> None:
         self._place = place

@@ -68,12 +68,7 @@ _log = logging.getLogger("enact.store")
 
 
 class Connector:
-    """Connects to whichever host of a database takes writes, the last good one first.
-
-    Args:
-        url: The database.
-        who: Who connects, for the database's own list.
-    """
+    """Connects to whichever host of a database takes writes, the last good one first."""
 
     def __init__(self, url: str, who: str) -> None:
         self.shown = without_password(url)
@@ -192,9 +187,6 @@ class Lookout:
     A server whose processes stand still keeps its connections, and its kernel answers for it, so no
     time-out of the network ends the wait.  A wait for the standby looks the same, and nothing may
     cut that short: a connection is given up only when another host is the primary.
-
-    Args:
-        connector: Knows the hosts.
     """
 
     def __init__(self, connector: Connector) -> None:

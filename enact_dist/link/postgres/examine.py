@@ -42,7 +42,6 @@ class ShardRow:
 
     Attributes:
         holder: Host and process that serve it; empty: none does.
-        epoch: Its epoch.
         batch: Number of its newest batch.
         standbys: Hosts and processes that stand by for it, with what they have counted.
         alive: Whether the holder renewed its lease while this was looked at.
@@ -80,12 +79,10 @@ class DatabaseReport:
         problem: Why it cannot be used; empty: it can.
         remedy: What to do about that.
         took_s: How long a connection took.
-        version: Version of the server.
         missing: Tables that are not there.
         copies: Names of the standbys that confirm commits.
         others: Names of other standbys, with their states.
         named: What `synchronous_standby_names` says.
-        shards: The shards of the cell.
     """
 
     problem: str = ""

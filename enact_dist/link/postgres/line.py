@@ -239,9 +239,6 @@ class Line:
 class Renewer:
     """Renews the lease of an idle store, on a line and a thread of its own.
 
-    Args:
-        tenure: Whose lease.
-
     Attributes:
         copies: How many standbys of the database confirm each commit; -1: this user cannot see it.
     """

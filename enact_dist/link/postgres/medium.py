@@ -36,13 +36,7 @@ _PARTS_AT_ONCE: Final = (4 << 20) // PART_BYTES
 
 
 class PostgresMedium:
-    """See `link.store.media.Medium` and `link.lease.Holding`.
-
-    Args:
-        tenure: The shard's row, held by this process.
-        session: An open connection.
-        renewer: Renews the lease from now on; this medium closes it.
-    """
+    """See `link.store.media.Medium` and `link.lease.Holding`; it closes its `renewer`."""
 
     tired = False
 

@@ -29,11 +29,7 @@ class AskedMove(NamedTuple):
 
 
 def ask_to_move(address: StoreAddress, host: str) -> AskedMove:
-    """Ask for it.
-
-    Args:
-        address: The shard.
-        host: Where a standby is to be; with its process, if it has several.
+    """Ask for a standby on `host`, named with its process if it has several.
 
     Raises:
         StoreError: No such standby is seen, no process serves the shard, or the database cannot be

@@ -114,7 +114,6 @@ class HeldShard(NamedTuple):
         medium: Renews the lease; `close` frees the shard.
         session: The connection of the medium, for reading until its first commit.
         shard: Its row.
-        epoch: The new epoch.
         batch: Number of the newest batch.
     """
 

@@ -35,7 +35,6 @@ class RaisedEpoch(NamedTuple):
     """What became of one shard.
 
     Attributes:
-        shard: Its name.
         before: Its epoch in the restored database.
         epoch: Its epoch now.
         batch: Number of its newest batch, which the restore brought back.

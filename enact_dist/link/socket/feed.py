@@ -53,13 +53,7 @@ class Reach(Protocol):
 
 
 class SocketFeed:
-    """Connects to each shard with a socket; uses Zenoh for the others.
-
-    Args:
-        carrier: The client's carrier.
-        queue: Receives the notices.
-        interest: The slots to watch; None: all.
-    """
+    """Connects to each shard with a socket; uses Zenoh for the others."""
 
     def __init__(self, carrier: Reach, queue: NoticeQueue, interest: Survey | None) -> None:
         self._carrier = carrier

@@ -196,10 +196,8 @@ class SocketLine:
         away: Whether the shard is known to be out of reach.
 
     Attributes:
-        name: As given.
         problem: Why the last attempt to connect failed; empty without a failure.
         idle: The connections that wait for a call; any thread may take one from the end.
-        closed: Whether it has ended.
     """
 
     def __init__(

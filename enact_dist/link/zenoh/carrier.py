@@ -88,7 +88,6 @@ class _Link:
     and reconnects by itself.
 
     Attributes:
-        endpoints: Where it connects.
         session: Carries calls and the token.
         names: Checks the names of the shards that answer, in a cell with keys.
     """

@@ -168,7 +168,6 @@ class LinkWatch:
 
     Attributes:
         lost: Destinations of lost connections, of a session that connects.
-        user_timeout_s: As given.
         left: Whether the session is closed and no longer watched.
 
     Args:

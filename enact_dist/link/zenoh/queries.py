@@ -85,11 +85,6 @@ def next_reply(
 ) -> zenoh.Sample | None:
     """Wait for a reply; return None if the query ended without one, or timed out.
 
-    Args:
-        replies: Of the query.
-        names: Checks that the reply is that of `shard`, in a cell with keys.
-        shard: The shard that was asked.
-
     Raises:
         ShardUnreachableError: The reply comes from a server with another name.
     """
@@ -169,11 +164,6 @@ class ShardPresence:
     Zenoh reports when a queryable for a key appears: 7 to 12 ms after the daemon's `ready`,
     measured on a loopback, against up to a quarter of a TTL until the next keep-alive.  If it is
     not closed before its session, it leaks 15 kB (Zenoh 1.10).
-
-    Args:
-        session: Stays open when this ends.
-        key: A key on which the shard takes requests.
-        returned: Called from another thread each time the shard comes within reach.
     """
 
     def __init__(self, session: zenoh.Session, key: str, returned: Callable[[], None]) -> None:

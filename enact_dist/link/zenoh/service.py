@@ -99,7 +99,6 @@ class ZenohService:
         proven: Whether certificates prove the names of clients.
 
     Attributes:
-        senders: Sends the answers.
         count: Adds to a counter of the shard.
         present: The tokens that are there: a session, and the identity that says it is there.
     """

@@ -284,9 +284,7 @@ class TlsLook:
     """What a handshake at an endpoint showed.
 
     Attributes:
-        endpoint: Where.
         reason: Why a connection is refused, by either side; empty if none is.
-        certificate: The certificate there, if it could be read.
         listens: Whether anything listens there.
     """
 
@@ -401,12 +399,8 @@ def why_refused(endpoints: Iterable[str], keys: KeyFiles | None, shard: str = ""
 def refusals(endpoints: Iterable[str], keys: KeyFiles | None, shard: str = "") -> dict[str, str]:
     """Return the TLS endpoints where a certificate is refused, each with the reason.
 
-    Takes at most `LOOK_S`, whatever a name server does.
-
-    Args:
-        endpoints: Where a shard should answer.
-        keys: The own files.
-        shard: The shard that is expected there; empty: any.
+    Without the name of a `shard` any may answer.  Takes at most `LOOK_S`, whatever a name server
+    does.
     """
     places = [one for one in dict.fromkeys(endpoints) if one.startswith("tls/")]
     if keys is None:

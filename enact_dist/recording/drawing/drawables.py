@@ -123,7 +123,6 @@ class ShownJoints(NamedTuple):
     """Joints by name.
 
     Attributes:
-        names: Of the joints.
         positions: (J,) floats, rad or m.
         speeds: (J,) floats, rad/s or m/s; None: the datum has none.
     """
