@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "enact_dist"
 LAYERS = (
     ("errors",),
-    ("comparing", "patterns", "retention"),
+    ("comparing", "extras", "patterns", "retention"),
     ("terms",),
     ("core.protocol",),
     ("core.failover", "core.rights"),

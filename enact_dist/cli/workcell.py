@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import argparse
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.cli.arguments import counted, file_of
-from enact_dist.cli.text.output import ProgressLine, print_json, print_table
-from enact_dist.cli.verbs import DONE, FAILED, OptionGroup, Verb, flag, option
+from enact_dist.cli.text.output import ProgressLine, print_table
+from enact_dist.cli.verbs import DONE, FAILED, OptionGroup, Output, Verb, flag, option
 from enact_dist.errors import ConfigError, EnactError
+from enact_dist.extras import needing
 
 if TYPE_CHECKING:
     from actors.geometry.cameras.charuco import Board
@@ -18,7 +20,6 @@ if TYPE_CHECKING:
 
 BOARD: Final = "8x11,0.024,0.018,4X4_50"
 """Fits on A4."""
-_EXTRA: Final = ("cv2", "scipy")
 _COLUMNS: Final = (
     "CAMERA", "PICTURES", "BOARD", "SHARED", "COVERED", "FOCAL PX", "RMS PX", "X, Y, Z M",
 )  # fmt: skip
@@ -74,20 +75,9 @@ VERBS: Final = (
 )  # fmt: skip
 
 
-def run_calibrate(options: argparse.Namespace) -> int:
+@needing("the calibration", "workcell", "cv2", "scipy")
+def run_calibrate(options: argparse.Namespace) -> Output | int:
     """Print a board, or calibrate cameras: what the options ask for."""
-    try:
-        return _calibrate(options)
-    except ImportError as error:
-        if (error.name or "").partition(".")[0] in _EXTRA:
-            raise ConfigError(
-                f"the calibration needs {error.name}, which is not installed; install its extra:"
-                " pip install -e '.[workcell]' in the clone of enact-dist"
-            ) from error
-        raise
-
-
-def _calibrate(options: argparse.Namespace) -> int:
     from actors.geometry.cameras.charuco import board_of
     from actors.geometry.files import InputFileError
 
@@ -109,13 +99,9 @@ def _calibrate(options: argparse.Namespace) -> int:
         line.end()
         print(f"enact workcell: {error}", file=sys.stderr)
         return FAILED
-    if options.json:
-        print_json(report)
-    else:
-        _print(report)
     for camera, why in report.left_out.items():
         print(f"enact workcell: camera {camera} is not in {report.file}: {why}", file=sys.stderr)
-    return FAILED if report.left_out else DONE
+    return Output(report, partial(_print, report), status=FAILED if report.left_out else DONE)
 
 
 def _take(folder: Path, board: Board, options: argparse.Namespace, line: ProgressLine) -> None:

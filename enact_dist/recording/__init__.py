@@ -41,7 +41,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 from enact_dist.config.shows import Shows
-from enact_dist.recording.libraries import require_libraries
+from enact_dist.extras import require
 
 if TYPE_CHECKING:
     from enact_dist.recording.exporting import ExportSummary, export_world
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from enact_dist.recording.replaying import Replay, ReplaySummary
     from enact_dist.recording.summary import RecordingSummary
 
-require_libraries()
+require("a recording", "record", "mcap", "foxglove_schemas_protobuf")
 
 __all__ = [
     "ExportSummary",

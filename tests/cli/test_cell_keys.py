@@ -212,7 +212,7 @@ def test_what_cannot_be_made_is_refused(folder, enact, words, change, said):
 def test_missing_library_is_named_with_its_extra(folder, enact, monkeypatch):
     """Only the host that makes keys needs it."""
     monkeypatch.setitem(sys.modules, "cryptography", None)
-    monkeypatch.setattr("enact_dist.cli.cell.keys.find_spec", lambda _: None)
+    monkeypatch.setattr("enact_dist.extras.find_spec", lambda _: None)
     status, _, err = enact("init")
     assert status == 2
     assert "pip install -e '.[keys]'" in err

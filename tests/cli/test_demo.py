@@ -54,8 +54,8 @@ def test_missing_extra_is_named_with_its_command(enact, monkeypatch):
 
     assert result.status == 2
     assert result.err == (
-        "enact: the demo needs open3d, which is not installed; install the actors extra:"
-        " pip install -e '.[actors]' in the clone of enact-dist\n"
+        "enact: the demo needs open3d, which is not installed: install the extra 'actors'"
+        " (pip install -e '.[actors]' in the clone of enact-dist)\n"
     )
 
 

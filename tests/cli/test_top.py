@@ -396,9 +396,7 @@ def test_screen_on_a_terminal_ends_with_the_terminal_as_it_was(how, spawn, cell_
 
 def test_screen_without_textual_names_the_extra(cell_file, monkeypatch, capsys):
     """And what needs it not."""
-    from enact_dist.cli.top import command
-
-    monkeypatch.setattr(command, "find_spec", lambda _: None)
+    monkeypatch.setattr("enact_dist.extras.find_spec", lambda _: None)
     monkeypatch.setattr(sys.stdin, "isatty", lambda: True, raising=False)
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
 

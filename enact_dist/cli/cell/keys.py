@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 from enact_dist.cli.target import cell_config
 from enact_dist.cli.verbs import DONE, FAILED, Output
 from enact_dist.config.table import suggestion
 from enact_dist.errors import ConfigError
+from enact_dist.extras import require
 
 if TYPE_CHECKING:
     import argparse
@@ -123,11 +123,7 @@ def _cell(options: argparse.Namespace) -> tuple[CellConfig, Path]:
             " endpoints (docs/security.md)",
             path=str(config.path),
         )
-    if find_spec("cryptography") is None:
-        raise ConfigError(
-            "making keys needs cryptography, which this Python does not have: install the extra"
-            " 'keys' (pip install -e '.[keys]' in the clone of enact-dist)"
-        )
+    require("the making of keys", "keys", "cryptography")
     return config, config.security.keys
 
 

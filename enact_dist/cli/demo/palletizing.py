@@ -4,31 +4,21 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from enact_dist.errors import ConfigError
+from enact_dist.extras import needing
 
 if TYPE_CHECKING:
     import argparse
 
     from actors.running_cell import DemoStore
 
-_EXTRA: Final = ("open3d", "scipy", "cv2")
-"""Modules of the `actors` extra, which the core does without."""
 
-
+@needing("the demo", "actors", "open3d", "scipy", "cv2")
 def run_palletizing(options: argparse.Namespace) -> int:
     """Run the demonstration that the options ask for."""
     _refuse_mixture(options)
-    try:
-        return _run(options)
-    except ImportError as error:
-        if (error.name or "").partition(".")[0] in _EXTRA or ".so" in str(error):
-            raise _missing(error) from error
-        raise
-
-
-def _run(options: argparse.Namespace) -> int:
     out: Path = options.out or Path("demo_out")
     if options.check_net:
         return _check_net(options.check_net, out)
@@ -104,14 +94,3 @@ def _refuse_mixture(options: argparse.Namespace) -> None:
         raise ConfigError(f"{option} can only be set when the cell is started, not with --cell")
     if option and (options.views or options.model):
         raise ConfigError(f"{option} belongs to the simulated sensor, not to real recordings")
-
-
-def _missing(error: ImportError) -> ConfigError:
-    if ".so" in str(error):
-        return ConfigError(
-            f"the demo cannot load a shared library ({error}); enact doctor names the package"
-        )
-    return ConfigError(
-        f"the demo needs {error.name}, which is not installed; install the actors extra:"
-        " pip install -e '.[actors]' in the clone of enact-dist"
-    )

@@ -6,29 +6,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.errors import ConfigError
+from enact_dist.extras import needing
 
 if TYPE_CHECKING:
     import argparse
 
-_EXTRA: Final = ("cv2", "scipy", "numba", "mujoco", "ompl", "ruckig")
-"""Modules of the `workcell` extra, which the core does without."""
+_MODULES: Final = ("cv2", "scipy", "numba", "mujoco", "ompl", "ruckig", "mcap")
+"""Modules that the demo needs beside those of the core."""
 _CHOICES: Final = ("scenario", "seed", "seconds", "voxel_m", "scale", "source")
 
 
+@needing("the demo", "workcell,record", *_MODULES, "foxglove_schemas_protobuf")
 def run_workcell(options: argparse.Namespace) -> int:
     """Run the demonstration that the options ask for."""
-    try:
-        return _run(options)
-    except ImportError as error:
-        if (error.name or "").partition(".")[0] in (*_EXTRA, "mcap", "foxglove_schemas_protobuf"):
-            raise ConfigError(
-                f"the demo needs {error.name}, which is not installed; install its extras:"
-                " pip install -e '.[workcell,record]' in the clone of enact-dist"
-            ) from error
-        raise
-
-
-def _run(options: argparse.Namespace) -> int:
     out: Path = options.out or Path("workcell_out")
     _refuse_mixture(options)
     if options.cameras:

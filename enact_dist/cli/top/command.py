@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 import time
 from contextlib import suppress
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.cli.lock import name_away
@@ -13,7 +12,8 @@ from enact_dist.cli.target import open_cell
 from enact_dist.cli.text.output import print_json, print_table
 from enact_dist.cli.top.tables import TABLES, headline
 from enact_dist.cli.verbs import DONE, UNREACHABLE
-from enact_dist.errors import ConfigError, ShardUnreachableError
+from enact_dist.errors import ShardUnreachableError
+from enact_dist.extras import require
 from enact_dist.link.signals import StopSignals
 from enact_dist.operate.cell_rates import CellLooks, pause_s
 
@@ -36,11 +36,8 @@ def run_top(options: argparse.Namespace) -> int:
     """
     on_screen = not options.once and not options.json and sys.stdout.isatty()
     on_screen = on_screen and sys.stdin.isatty()
-    if on_screen and find_spec("textual") is None:
-        raise ConfigError(
-            "enact top needs textual, which this Python does not have: install the extra 'view'"
-            " (pip install -e '.[view]' in the clone of enact-dist); enact top --once needs it not"
-        )
+    if on_screen:
+        require("the screen of enact top (not --once)", "view", "textual")
     with StopSignals() as stop, open_cell(options) as cell:
         with suppress(ShardUnreachableError):  # which the tables show
             for name in options.world or ():
