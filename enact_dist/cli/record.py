@@ -19,7 +19,7 @@ from enact_dist.cli.arguments import (
     tolerance,
 )
 from enact_dist.cli.target import cell_target, is_endpoint, open_cell
-from enact_dist.cli.text.output import ProgressLine, print_json, shown_bytes
+from enact_dist.cli.text.output import ProgressLine, shown_bytes
 from enact_dist.cli.text.times import MOMENT_HELP, moment
 from enact_dist.cli.verbs import (
     DONE,
@@ -27,6 +27,7 @@ from enact_dist.cli.verbs import (
     NOUNS,
     Option,
     OptionGroup,
+    Output,
     Verb,
     flag,
     many,
@@ -148,7 +149,7 @@ VERBS: Final = (
 # ---------------------------------------------------------------- record
 
 
-def run_record(options: argparse.Namespace) -> int:
+def run_record(options: argparse.Namespace) -> Output:
     """Record until a signal or for so many seconds; fail where versions or aspects are missing."""
     from enact_dist.recording import Recorder
 
@@ -170,15 +171,10 @@ def run_record(options: argparse.Namespace) -> int:
             tell=lambda so_far: line.show(_recorded_line(so_far)),
         )
     line.end()
-    if options.json:
-        print_json(summary)
-    else:
-        print(_recorded_line(summary))
-        for slot, count in summary.gap_slots.items():
-            print(f"  missing {count} of {slot}")
-        for name, count in summary.counts.items():
-            print(f"  {name}: {count}")
-    return FAILED if summary.missing or summary.unknown_aspects else DONE
+    missing = (f"  missing {count} of {slot}" for slot, count in summary.gap_slots.items())
+    counts = (f"  {name}: {count}" for name, count in summary.counts.items())
+    status = FAILED if summary.missing or summary.unknown_aspects else DONE
+    return Output(summary, "\n".join((_recorded_line(summary), *missing, *counts)), status=status)
 
 
 def shows_of(options: argparse.Namespace) -> dict[str, Shows]:
@@ -214,7 +210,7 @@ def _recorded_line(summary: RecordingSummary) -> str:
 # ---------------------------------------------------------------- replay
 
 
-def run_replay(options: argparse.Namespace) -> int:
+def run_replay(options: argparse.Namespace) -> Output | int:
     """Commit a recording again until its end or a signal; fail where nothing in it was chosen.
 
     Raises:
@@ -259,16 +255,12 @@ def run_replay(options: argparse.Namespace) -> int:
             show=warn,
         )
     line.end()
-    if options.json:
-        print_json(summary)
-    else:
-        print(_replayed_line(summary))
-        for slot, who in summary.other_writers.items():
-            print(f"  {slot}: {who} also writes it")
-    if summary.rounds and not summary.versions:
+    nothing = bool(summary.rounds and not summary.versions)
+    if nothing:
         print("enact: no recorded data match the options, so nothing was set", file=sys.stderr)
-        return FAILED
-    return DONE
+    others = (f"  {slot}: {who} also writes it" for slot, who in summary.other_writers.items())
+    text = "\n".join((_replayed_line(summary), *others))
+    return Output(summary, text, status=FAILED if nothing else DONE)
 
 
 def _given(options: argparse.Namespace, among: Iterable[Part]) -> list[str]:

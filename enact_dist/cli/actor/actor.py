@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.cli.target import cell_config, see_modules
-from enact_dist.cli.text.output import print_json
 from enact_dist.cli.verbs import DONE, FAILED, Output
 from enact_dist.config.rights import RIGHTS_FILE
 from enact_dist.errors import ConfigError, EnactError, ProtocolError
@@ -101,7 +100,7 @@ def _state(info: ActorInfo, reported: str) -> str:
     return f"{state}, one of {len(info.namesakes) + 1}" if info.namesakes else state
 
 
-def check_actors(options: argparse.Namespace) -> int:
+def check_actors(options: argparse.Namespace) -> Output:
     """Print what is wrong with the actors of a `cell.toml`; status 1 if there is an error."""
     from enact_dist.actor.check import check_cell
 
@@ -115,16 +114,12 @@ def check_actors(options: argparse.Namespace) -> int:
         _write_rights(config)
     findings = check_cell(config, initial=options.initial)
     wrong = any(finding.level == "error" for finding in findings)
-    if options.json:
-        print_json(findings)
-    else:
-        for finding in findings:
-            print(finding)
-        if all(finding.level == "advice" for finding in findings):
-            print(f"ok: {len(config.actors)} actors of cell {config.name} fit together")
+    lines = [str(finding) for finding in findings]
+    if all(finding.level == "advice" for finding in findings):
+        lines.append(f"ok: {len(config.actors)} actors of cell {config.name} fit together")
     if options.graph is not None:
         _draw(config, options.graph)
-    return FAILED if wrong else DONE
+    return Output(findings, "\n".join(lines), status=FAILED if wrong else DONE)
 
 
 def _write_rights(config: CellConfig) -> None:

@@ -9,8 +9,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.cli.target import open_cell
-from enact_dist.cli.text.output import print_json
-from enact_dist.cli.verbs import DONE, UNREACHABLE
+from enact_dist.cli.verbs import DONE, UNREACHABLE, Output
 from enact_dist.config.rights import DATA_LISTS, NAMED_LISTS
 from enact_dist.core.rights.rules import UNPROVEN, WRITING, data_path, fork_path
 from enact_dist.errors import ConfigError, LinkError
@@ -46,7 +45,7 @@ class LearnedRefusal:
     last_s: float
 
 
-def learn(config: CellConfig, options: argparse.Namespace) -> int:
+def learn(config: CellConfig, options: argparse.Namespace) -> Output:
     """Collect what the shards of a running cell refuse; print rules that would allow it.
 
     Raises:
@@ -63,13 +62,9 @@ def learn(config: CellConfig, options: argparse.Namespace) -> int:
             print("enact: interrupted; this was learned so far", file=sys.stderr)
     known = config.rights.names(config.actor_names, config.security.operators)
     text = "\n".join(rule_lines(learner.learned(), known))
-    if options.json:
-        print_json({"refusals": learner.learned(), "rules": text})
-    elif text:
-        print(text)
-    else:
-        print("nothing was refused")
-    return UNREACHABLE if learner.unreachable else DONE
+    facts = {"refusals": learner.learned(), "rules": text}
+    status = UNREACHABLE if learner.unreachable else DONE
+    return Output(facts, text or "nothing was refused", status=status)
 
 
 def _collect(cell: Cell, learner: Learner, for_s: float) -> None:

@@ -7,14 +7,15 @@ import sys
 import time
 from collections import Counter
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.cli.arguments import pairs
 from enact_dist.cli.shard.shard import refuse_shared, whole_store
 from enact_dist.cli.target import cell_config
-from enact_dist.cli.text.output import ProgressLine, print_json, print_table, shown_bytes
-from enact_dist.cli.verbs import DONE
+from enact_dist.cli.text.output import ProgressLine, print_table, shown_bytes
+from enact_dist.cli.verbs import Output
 from enact_dist.errors import ConfigError, StoreError
 from enact_dist.world.trees import shown_s
 
@@ -28,7 +29,7 @@ LISTED_MAX: Final = 20
 """So many moves are listed one by one for people; `--json` lists all."""
 
 
-def run_rebalance(options: argparse.Namespace) -> int:
+def run_rebalance(options: argparse.Namespace) -> Output:
     """Move what has to be moved; it may be killed at any time and called again."""
     from enact_dist.link.offline.rebalance import look, rebalance
 
@@ -48,13 +49,10 @@ def run_rebalance(options: argparse.Namespace) -> int:
                 found = rebalance(folders, placement, unix_s=int(time.time()), progress=progress)
     finally:
         progress.line.end()
-    if options.json:
-        moves = [move._asdict() for move in found.moves]
-        print_json({"done": not options.dry_run, "resumed": found.resumed, "moves": moves})
-    else:
-        _print(found, dry_run=options.dry_run)
     _name_others(config, folders)
-    return DONE
+    moves = [move._asdict() for move in found.moves]
+    facts = {"done": not options.dry_run, "resumed": found.resumed, "moves": moves}
+    return Output(facts, partial(_print, found, dry_run=options.dry_run))
 
 
 def _in_database(
