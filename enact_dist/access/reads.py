@@ -3,13 +3,12 @@
 `Readings` is the part that `Lock` and `Snapshot` share.  A datum is decoded once; arrays in it are
 read-only views of the received bytes.
 
-Detects data that a block changes in place, which its commit would miss.
-
-What a commit publishes is what was assigned.  Arrays are read-only, so that numpy says so at once;
-a list or dict can be changed all the same, also one inside a dataclass.  So what a block has looked
-at of such data, and might have written, is compared with its bytes before the commit.  Numbers,
-texts and arrays cost nothing: they are not remembered.  Nor is what has a value of a codec in it:
-a codec may write the same value in other bytes each time.
+A commit publishes what was assigned, and would miss data that the block changed in place.  Arrays
+are read-only, so that numpy says so at once; a list or dict can be changed all the same, also one
+inside a dataclass.  So what a block has looked at of such data, and might have written, is compared
+with its bytes before the commit (`writes.refuse_changed`).  Numbers, texts and arrays cost nothing:
+they are not remembered.  Nor is what has a value of a codec in it: a codec may write the same value
+in other bytes each time.
 """
 
 from __future__ import annotations

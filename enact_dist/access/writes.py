@@ -1,11 +1,11 @@
-"""What a lock writes: data on their way into their shards' memory, until the lock ends.
+"""What a lock writes: data on their way into their shards' memory, and what they were made of.
 
 Large data are written there at once (see `link.memory.payload_client`), small ones, and those of
 shards that share no memory with this process, travel with the commit.  `blank` returns memory to
 fill in place.  Once the block ends, the program cannot change it any more, not even through a view
 that it kept or by `setflags`: large memory is detached (see `Draft.close`), small memory is copied.
 
-What went into a commit: the data that its lock read, for their lineage (`Cell.why`).
+A commit names as its causes, for `Cell.why`, the data that its lock read:
 
 ===================  ==========================================================================
 request              counts as read

@@ -1,6 +1,4 @@
-"""How recordings and `enact view` show the data of an aspect, and in which frame.
-
-Configured, or guessed by shape.
+"""How recordings and `enact view` show the data of an aspect: as configured, or guessed by shape.
 
 ::
 

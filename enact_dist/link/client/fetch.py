@@ -3,11 +3,9 @@
 Data of all shards are fetched together through one window (`Transfer`): the slices of many matching
 images follow each other like those of one large cloud.
 
-Data that this process has seen, by version, so that a shard does not send them again.
-
-The key of a datum is (shard, epoch, slot, version): versions of volatile slots start again with
-each epoch, so a version alone would be ambiguous.  The cache has a byte limit and evicts the least
-recently used data first.
+The cache holds data that this process has seen, so that a shard does not send them again, by
+(shard, epoch, slot, version): versions of volatile slots start again with each epoch, so a version
+alone would be ambiguous.  It has a byte limit and evicts the least recently used data first.
 """
 
 from __future__ import annotations

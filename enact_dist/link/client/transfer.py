@@ -8,12 +8,10 @@ The window bounds what either end holds at one time.  It grows with each answer 
 loss.  Time limits follow the speed seen so far, so that a slow network is not asked again for
 slices that it still carries.
 
-Stages large data at a shard in slices, ahead of the commit, which then only names them.
-
-A commit over a network is therefore always a short message, and urgent commits of this process and
-others never wait behind data.  Slices go to all shards of the commit through one window
-(`Transfer`).  Each slice carries its position, so slices may arrive twice, late or out of order,
-and a transfer resumes after a network cut.
+Large data of a commit are staged at their shards ahead of it, through one window for all shards;
+the commit then only names them.  So it is always a short message, and urgent commits of this
+process and others never wait behind data.  Each slice carries its position: it may arrive twice,
+late or out of order.
 
 Staged data end with their session at the shard, or when the shard is asked to drop them.  A shard
 that has lost them nevertheless answers `no_payload`, and they are sent again.

@@ -1,11 +1,9 @@
-"""Digests of all files of a backup, so that a restore can detect a single changed byte.
+"""The files of a backup: readable by their owner only, with digests that tell one changed byte.
 
 ``backup.json`` holds the size and SHA-256 of every other file and ends with the SHA-256 of its own
 preceding text.  A store checks its data where it decides something; a backup may lie on other disks
 and cross networks for a year before it is read once.  The text also records the permissions of the
 shard's files, since the copies are readable by their owner only.
-
-Copies that only their owner can read, from the first byte on, whatever the umask.
 
 A folder is built beside its destination and renamed when it is complete.  One process at a time
 builds it, under a lock that ends with the process; the next one deletes the remains of a killed
