@@ -12,13 +12,14 @@ one box.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from statistics import fmean
 from typing import TYPE_CHECKING, Final
 from xml.sax.saxutils import escape, quoteattr
 
 from enact_dist.actor.uses import uses_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from enact_dist.actor.uses import ActorDeclaration, Use
 
@@ -303,9 +304,11 @@ def _place_actors(
     graph: ActorGraph, layout: Layout, side: Sequence[Group], x: float, width: float
 ) -> None:
     """Stack the actors of one side, each as near to the middle of its data as there is room."""
-    at: Callable[[Group], float] = lambda group: _mean(  # noqa: E731
-        [layout.aspects[line.datum].middle_y for line in graph.lines if line.group == group.key]
-    )
+
+    def at(group: Group) -> float:
+        lines = [line for line in graph.lines if line.group == group.key]
+        return fmean([layout.aspects[line.datum].middle_y for line in lines] or [0.0])
+
     heights = {
         group.key: max(
             len(group.lines) * (ROW - 4.0) + GAP,
@@ -322,19 +325,12 @@ def _place_actors(
     ceiling = max((box.bottom for box in layout.worlds.values()), default=0.0)
     for index in range(len(order) - 1, -1, -1):  # back up, where the last ones hang over
         height = heights[order[index].key]
-        lowest = max(ceiling - height, MARGIN + _stacked(order[:index], heights))
+        above = sum(heights[group.key] + 2.0 * GAP for group in order[:index])
+        lowest = max(ceiling - height, MARGIN + above)
         tops[index] = min(tops[index], lowest)
         ceiling = tops[index] - 2.0 * GAP
     for group, top in zip(order, tops, strict=True):
         layout.actors[group.key] = Box(x, top, width, heights[group.key])
-
-
-def _stacked(groups: Sequence[Group], heights: Mapping[str, float]) -> float:
-    return sum(heights[group.key] + 2.0 * GAP for group in groups)
-
-
-def _mean(numbers: Sequence[float]) -> float:
-    return sum(numbers) / len(numbers) if numbers else 0.0
 
 
 def _place_lines(graph: ActorGraph, layout: Layout, left: set[str]) -> None:

@@ -65,7 +65,9 @@ class Repeated:
         """Return the count to report: 0 for the first, None for not now."""
         known = self._kinds.get(kind)
         if known is None and len(self._kinds) >= KINDS_MAX:
-            self._forget_quiet(now_ns)
+            for name, one in list(self._kinds.items()):
+                if not one.untold and now_ns >= one.due_ns + one.pause_ns:
+                    del self._kinds[name]
             if len(self._kinds) >= KINDS_MAX:
                 kind = None
                 known = self._kinds.get(kind)
@@ -87,11 +89,6 @@ class Repeated:
         for kind in self._kinds.values():
             kind.untold = 0
         return found
-
-    def _forget_quiet(self, now_ns: int) -> None:
-        for name, kind in list(self._kinds.items()):
-            if not kind.untold and now_ns >= kind.due_ns + kind.pause_ns:
-                del self._kinds[name]
 
 
 def kind_of(error: BaseException) -> Hashable:
@@ -350,7 +347,10 @@ def encode_reports(reports: list[ActorStatistics]) -> bytes:
     """
     rows = [{name: getattr(report, name) for name in _NAMES} for report in reports]
     encoded = _packed(rows)
-    for shorten in (_without_writes, _brief, _named):
+    if len(encoded) > REPORT_BYTES_MAX:
+        rows = [{name: row[name] for name in row if name != "writes"} for row in rows]
+        encoded = _packed(rows)
+    for shorten in (_brief, _named):
         if len(encoded) > REPORT_BYTES_MAX:
             rows = [shorten(row) for row in rows]
             encoded = _packed(rows)
@@ -364,10 +364,6 @@ def encode_reports(reports: list[ActorStatistics]) -> bytes:
 def _packed(rows: list[dict[str, Any]], **more: int) -> bytes:
     encoded: bytes = msgpack.packb({"version": REPORT_VERSION, "actors": rows, **more})
     return encoded
-
-
-def _without_writes(row: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in row.items() if name != "writes"}
 
 
 def _brief(row: dict[str, Any]) -> dict[str, Any]:

@@ -183,7 +183,10 @@ def name_away(shard: ShardInfo | ShardRates) -> None:
 
 
 def _row(lock: LockInfo, known: dict[tuple[str, int], LockInfo]) -> tuple[object, ...]:
-    blockers = [_blocker(number, known.get((lock.shard, number))) for number in lock.waits_for]
+    others = ((number, known.get((lock.shard, number))) for number in lock.waits_for)
+    blockers = [
+        f"{number} ({who(one)})" if one is not None else str(number) for number, one in others
+    ]
     return (
         lock.number,
         lock.shard,
@@ -203,10 +206,6 @@ def who(lock: LockInfo) -> str:
     return shown(f"{lock.actor}@{lock.host} pid {lock.pid}")
 
 
-def _blocker(number: int, lock: LockInfo | None) -> str:
-    return f"{number} ({who(lock)})" if lock is not None else str(number)
-
-
 # ---------------------------------------------------------------- hold
 
 
@@ -214,10 +213,8 @@ def hold_lock(options: argparse.Namespace) -> int:
     """Hold a lock while a command runs."""
     if not options.command:
         raise ConfigError("lock hold needs a command: enact lock hold REQUEST … -- COMMAND …")
-    with (
-        StopSignals() as stop,
-        open_cell(options, observer=False, actor=_command_name(options)) as cell,
-    ):
+    name = f"hold:{os.path.basename(options.command[0])}"  # noqa: PTH119 (a word, not a file)
+    with StopSignals() as stop, open_cell(options, observer=False, actor=name) as cell:
         return _hold(cell, options, stop)
 
 
@@ -264,10 +261,6 @@ def _shards_of(client: CellClient, items: Iterable[Item]) -> Iterator[str]:
     """Yield the shards on which these data lie: those of a pattern on any."""
     for item in items:
         yield from client.shards() if "*" in item.entity else (client.shard_of(item.entity),)
-
-
-def _command_name(options: argparse.Namespace) -> str:
-    return f"hold:{os.path.basename(options.command[0])}"  # noqa: PTH119 (a word, not a file)
 
 
 def _item(cell: Cell, request: tuple[str, str, str, str], default: str | None) -> Item:
@@ -330,15 +323,12 @@ def list_audit(options: argparse.Namespace) -> Output:
             cell.acknowledge_alarms(shard=options.shard, how=options.acknowledge)
         shards, status = in_reach(cell)
         entries = cell.audit(shards)
+    times = (datetime.fromtimestamp(one.stamp_s).astimezone() for one in entries)
     rows = [
-        (_local_time(one.stamp_s), one.shard, one.kind, one.identity or "-", one.text)
-        for one in entries
+        (at.isoformat(" ", "seconds"), one.shard, one.kind, one.identity or "-", one.text)
+        for at, one in zip(times, entries, strict=True)
     ]
     return Output(entries, rows=rows, status=status)
-
-
-def _local_time(stamp_s: float) -> str:
-    return datetime.fromtimestamp(stamp_s).astimezone().isoformat(" ", "seconds")
 
 
 def _shard_of(number: int, cell: Cell) -> str:

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     import argparse
     from collections.abc import Sequence
 
-    from enact_dist.config.types import ActorProcess, CellConfig, ShardConfig
-    from enact_dist.operate.supervise import Say, Task
+    from enact_dist.config.types import CellConfig, ShardConfig
+    from enact_dist.operate.supervise import Say
 
 LOOK_S: Final = 0.2
 """How often a shard that runs already is looked at."""
@@ -53,8 +53,9 @@ VERBS: Final = (
 
 def run_up(options: argparse.Namespace) -> int:
     """Run the cell until a signal; drain actors, then shards."""
-    from enact_dist.operate.supervise import Supervisor
+    from enact_dist.operate.supervise import Supervisor, Task
 
+    log: str = options.log
     config = cell_config(options)
     see_modules(config.path)
     host = options.host or socket.gethostname()
@@ -70,11 +71,20 @@ def run_up(options: argparse.Namespace) -> int:
     for shard in shards:
         _refuse_second(config, shard)
     tasks = [
-        *(_task(config, "shard", shard.name, options.log, shard.drain_s) for shard in shards),
-        *(_actor_task(config, process, options.log) for process in processes_of(actors)),
-    ]
+        *(
+            Task(one.name, "shard", _command(config, "shard", (one.name,), log), one.drain_s or 0.0)
+            for one in shards
+        ),
+        *(
+            Task(
+                one.name, "actor", _command(config, "actor", one.members, log),
+                one.drain_s or 0.0, one.env,
+            )
+            for one in processes_of(actors)
+        ),
+    ]  # fmt: skip
     say: Say = _Log([task.name for task in tasks])
-    if options.log == "json":
+    if log == "json":
         shared = {process.name for process in config.processes() if len(process.actors) > 1}
         kinds = {task.name: "process" if task.name in shared else task.kind for task in tasks}
         say = _JsonLog(config.name, {name: f"{kind} {name}" for name, kind in kinds.items()})
@@ -216,19 +226,6 @@ def _refuse_second(config: CellConfig, shard: ShardConfig) -> None:
             time.sleep(LOOK_S)
         else:
             return
-
-
-def _actor_task(config: CellConfig, process: ActorProcess, log: str) -> Task:
-    from enact_dist.operate.supervise import Task
-
-    words = _command(config, "actor", process.members, log)
-    return Task(process.name, "actor", words, process.drain_s or 0.0, process.env)
-
-
-def _task(config: CellConfig, kind: str, name: str, log: str, drain_s: float | None = None) -> Task:
-    from enact_dist.operate.supervise import Task
-
-    return Task(name, kind, _command(config, kind, (name,), log), drain_s or 0.0)
 
 
 def _command(config: CellConfig, kind: str, names: tuple[str, ...], log: str) -> tuple[str, ...]:

@@ -17,6 +17,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.config.read import load_config
 from enact_dist.config.types import is_locked
 from enact_dist.core.state.clock import is_kept, state_of
 from enact_dist.errors import ConfigError, EnactError, ShardUnreachableError
@@ -76,28 +77,19 @@ def examine(target: str, *, timeout_s: float = 5.0) -> Iterator[Finding]:
     config = None
     if Path(target).suffix == ".toml" or Path(target).exists():
         try:
-            config = _config(target)
+            config = load_config(target)
         except ConfigError as error:
             yield fail("cell.toml", str(error), "correct the file")
             return
-        yield ok("cell.toml", f"{target}: cell {config.name}, {_counts(config)}")
+        counts = (
+            f"{len(config.shards)} shards, {len(config.worlds)} world contexts,"
+            f" {len(config.actors)} actors"
+        )
+        yield ok("cell.toml", f"{target}: cell {config.name}, {counts}")
         yield from keys(config)
     kept = yield from _cell(target, config, timeout_s)
     if config is not None:
         yield from database(config) if config.store else folders(config, kept)
-
-
-def _config(target: str) -> CellConfig:
-    from enact_dist.config.read import load_config
-
-    return load_config(target)
-
-
-def _counts(config: CellConfig) -> str:
-    return (
-        f"{len(config.shards)} shards, {len(config.worlds)} world contexts,"
-        f" {len(config.actors)} actors"
-    )
 
 
 # ---------------------------------------------------------------- this machine

@@ -272,9 +272,8 @@ class Supervisor:
         self._start("shard")
         try:
             while not stop.is_set() and not self._failed:
-                if not self._actors_started and (
-                    self._all_ready() or time.monotonic() - started_s > READY_S
-                ):
+                up = all(child.ready for child in self._of("shard"))
+                if not self._actors_started and (up or time.monotonic() - started_s > READY_S):
                     self._actors_started = True
                     self._start("actor")
                 self._take_event(0.1)
@@ -299,15 +298,12 @@ class Supervisor:
                 self._sink(name, line)
             except BrokenPipeError:
                 # The reader of the log is gone; that is no reason to stop a robot.
-                self._sink = _say_nothing
+                self._sink = lambda _name, _line: None
             except (OSError, ValueError):  # a full disk, a character that it does not have
                 self._lost += 1
 
     def _of(self, kind: str) -> list[_Child]:
         return [child for child in self._children if child.task.kind == kind]
-
-    def _all_ready(self) -> bool:
-        return all(child.ready for child in self._of("shard"))
 
     def _start(self, kind: str) -> None:
         for child in self._of(kind):
@@ -382,10 +378,6 @@ def ended_how(status: int) -> str:
         return f"ended by {signal.Signals(-status).name}"
     except ValueError:  # one of those for programs' own use
         return f"ended by signal {-status}"
-
-
-def _say_nothing(_name: str, _line: str) -> None:
-    pass
 
 
 def end_with_supervisor() -> None:

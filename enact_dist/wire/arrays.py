@@ -98,7 +98,7 @@ def _read(node: object, depth: int, fields_left: list[int]) -> np.dtype[Any]:
         if math.prod(shape) * max(1, item.itemsize) > _ITEM_BYTES_MAX:
             raise DtypeError(f"an inner array of shape {shape} is too large")
         return _checked(np.dtype((item, shape)))
-    if node.keys() != {"itemsize", "fields"} or not _is_sequence(node["fields"]):
+    if node.keys() != {"itemsize", "fields"} or type(node["fields"]) not in {tuple, list}:
         raise DtypeError(f"{reprlib.repr(node)} describes no dtype")
     fields_left[0] -= len(node["fields"])
     if fields_left[0] < 0:
@@ -134,10 +134,6 @@ def _checked(dtype: np.dtype[Any]) -> np.dtype[Any]:
 
 def _are_titles(title: list[object]) -> bool:
     return not title or (len(title) == 1 and type(title[0]) is str and title[0] != "")
-
-
-def _is_sequence(node: object) -> bool:
-    return type(node) is tuple or type(node) is list
 
 
 def checked_shape(node: object) -> tuple[int, ...]:

@@ -34,7 +34,8 @@ class Codec:
     decode: Callable[[Any], object]
 
 
-_by_type: dict[type[Any], Codec] = {}
+by_type: dict[type[Any], Codec] = {}
+"""The codec of exactly this type."""
 _by_name: dict[str, Codec] = {}
 changed: list[Callable[[], None]] = []
 """Called after each registration: a type read before may have another shape now."""
@@ -65,7 +66,7 @@ def register_codec(
         raise MisuseError(f"{datum_type!r} needs no codec: it is plain, or no class at all")
     if not _NAME.match(name):
         raise MisuseError(f"{name!r} cannot name a codec; use letters, digits, '_', '.', '-'")
-    other, before = _by_name.get(name), _by_type.get(datum_type)
+    other, before = _by_name.get(name), by_type.get(datum_type)
     if other is not None and _identity(other.datum_type) != _identity(datum_type):
         raise MisuseError(
             f"the codec name {name!r} belongs to {_identity(other.datum_type)}; asked for"
@@ -76,15 +77,10 @@ def register_codec(
             f"{_identity(datum_type)} has the codec {before.name!r} already; asked for {name!r}"
         )
     codec = Codec(datum_type, name, encode, decode)
-    _by_type[datum_type] = _by_name[name] = codec
+    by_type[datum_type] = _by_name[name] = codec
     CODED.add(datum_type)
     for tell in changed:
         tell()
-
-
-def codec_of(datum_type: type[Any]) -> Codec | None:
-    """Return the codec registered for exactly this type."""
-    return _by_type.get(datum_type)
 
 
 def _identity(datum_type: type[Any]) -> str:

@@ -117,7 +117,7 @@ def _shape(hint: Any, where: str, around: tuple[type[Any], ...]) -> Shape:
     """Return the shape of an annotation found at `where`, inside these dataclasses."""
     if len(around) > DEPTH_MAX:
         raise DatumTypeError(f"{where} is nested deeper than {DEPTH_MAX}")
-    codec = codecs.codec_of(hint)
+    codec = codecs.by_type.get(hint)
     if codec is not None:
         return CodecOf(codec)
     if hint is Any:

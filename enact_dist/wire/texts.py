@@ -49,23 +49,15 @@ def is_safe(text: str) -> bool:
 def shown(text: str, *, lines: bool = False) -> str:
     r"""Return a text as people may see it: unsafe characters as ``\x1b`` or ``\u202e``.
 
-    Args:
-        text: From anywhere.
-        lines: Whether it may have several lines, and tabs.
+    With `lines` it may have several lines, and tabs.
     """
     if text.isprintable():
         return text
-    return (_unsafe_in_lines if lines else _unsafe).sub(_escape, text)
+    return (_unsafe_in_lines if lines else _unsafe).sub(lambda found: repr(found[0])[1:-1], text)
 
 
 def shown_json(text: str) -> str:
     r"""Return a JSON text whose strings hold no unsafe character as such, but ``\u001b``."""
-    return text if text.isprintable() else _unsafe_in_lines.sub(_json_escape, text)
-
-
-def _escape(found: re.Match[str]) -> str:
-    return repr(found[0])[1:-1]
-
-
-def _json_escape(found: re.Match[str]) -> str:
-    return f"\\u{ord(found[0]):04x}"
+    if text.isprintable():
+        return text
+    return _unsafe_in_lines.sub(lambda found: f"\\u{ord(found[0]):04x}", text)

@@ -383,24 +383,22 @@ def shard_info(client: CellClient, shard: str) -> ShardInfo:
     try:
         return _asked_info(client, shard)
     except LinkError as error:
-        endpoint = client.carrier.endpoint_of(shard)
-        return ShardInfo(shard, endpoint, reachable=False, problem=str(error))
+        return away_info(client, shard, str(error))
 
 
 def _asked_info(client: CellClient, shard: str) -> ShardInfo:
     question = (shard, ListSessions())
-    endpoint = client.carrier.endpoint_of(shard)
     if client.core.needs_hello(shard):
         # Its welcome names the carrier of later calls.  A silent shard is waited for only once.
         hello = (shard, client.core.hello(shard))
         if client.call_once([hello, question])[1] is None:
-            return _silent(client, shard, endpoint)
+            return away_info(client, shard, client.carrier.reason_away(shard))
     started_s = time.monotonic()
     answer = client.call_once([question])[0]
     round_trip_s = time.monotonic() - started_s
     raise_denied(answer)
     if not isinstance(answer, Sessions):
-        return _silent(client, shard, endpoint)
+        return away_info(client, shard, client.carrier.reason_away(shard))
     return answered_info(client, shard, answer, round_trip_s)
 
 
@@ -414,8 +412,9 @@ def raise_denied(answer: Answer | None) -> None:
         raise error_of(answer)
 
 
-def _silent(client: CellClient, shard: str, endpoint: str) -> ShardInfo:
-    problem = client.carrier.reason_away(shard)
+def away_info(client: CellClient, shard: str, problem: str) -> ShardInfo:
+    """Return what is known of a shard that does not answer."""
+    endpoint = client.carrier.endpoint_of(shard)
     return ShardInfo(shard, endpoint, reachable=False, problem=problem)
 
 

@@ -28,6 +28,7 @@ from enact_dist.world.listings import (
     ShardInfo,
     actor_infos,
     answered_info,
+    away_info,
     lock_info,
     raise_denied,
 )
@@ -87,7 +88,10 @@ def look_at(client: CellClient, slots: Survey | None) -> Look:
     look = Look(
         unix_s,
         time.monotonic() - started_s,
-        tuple(infos.get(shard) or _away(client, shard, problems) for shard in shards),
+        tuple(
+            infos.get(shard) or away_info(client, shard, problems.get(shard, ""))
+            for shard in shards
+        ),
         tuple(one for one in actor_infos(there) if one.session != client.core.session),
         tuple(
             lock_info(shard, holder)
@@ -138,8 +142,3 @@ def _answers(
         if isinstance(answer, Refused):
             problems[shard] = answer.text
     return found
-
-
-def _away(client: CellClient, shard: str, problems: Mapping[str, str]) -> ShardInfo:
-    endpoint = client.carrier.endpoint_of(shard)
-    return ShardInfo(shard, endpoint, reachable=False, problem=problems.get(shard, ""))

@@ -290,7 +290,7 @@ def test_shard_that_comes_back_is_told_after_one_that_could_not_be(
         if len(told) == 1:
             raise RuntimeError("nobody listens")
 
-    calls._returned = tell
+    calls.pass_return = tell
     calls.submit("s1", RESOLVE)
     until(lambda: calls._lines["s1"]._silent_since_s)
     first = daemon(endpoint, "s1")

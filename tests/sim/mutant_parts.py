@@ -23,6 +23,6 @@ def _without_ended(method: Any) -> Any:
         tenures = self._state.tenures.by_lock
         for lock in [lock for lock in self._ask_ns if lock not in tenures]:
             del self._ask_ns[lock]
-        yield from method(self)
+        return method(self)
 
     return wrong

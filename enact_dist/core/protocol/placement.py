@@ -29,8 +29,6 @@ def shard_of(entity: str, placement: PlacementMap) -> str:
         return placement.shards[0].name
     if not placement.shards:
         raise ValueError("the placement map names no shard")
-    return max((_score(entity, shard.name), shard.name) for shard in placement.shards)[1]
-
-
-def _score(entity: str, shard: str) -> bytes:
-    return blake2b(f"{shard}\0{entity}".encode(), digest_size=8).digest()
+    names = [shard.name for shard in placement.shards]
+    scores = (blake2b(f"{name}\0{entity}".encode(), digest_size=8).digest() for name in names)
+    return max(zip(scores, names, strict=True))[1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
+from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.messages import (
@@ -157,14 +158,10 @@ def surveyed(state: ShardState, message: Survey, *, stamp_ns: int) -> Surveyed:
         message.after,
         listed,
         epoch=state.epoch,
-        version_of=_version_of,
+        version_of=attrgetter("version"),
         bytes_of=_bytes_of,
     )
     return Surveyed(state.epoch, state.commits.notice_number, stamp_ns, *page_of(steps))
-
-
-def _version_of(state: SlotState) -> int:
-    return state.version
 
 
 def _bytes_of(state: SlotState) -> int:

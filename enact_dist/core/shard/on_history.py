@@ -1,9 +1,7 @@
-"""History at the shard's door: which versions are known, and which of them labels keep.
+"""History and lineage at the shard's door: known versions, their labels, causes and effects.
 
-Lineage at the shard's door: which data a version came from, and what came of a datum.
-
-Both are looked up in the causes that hang on the known versions, so that lineage goes back as far
-as the history does, and no further index is kept up to date by every commit.
+Causes and effects are looked up in what hangs on the known versions, so that lineage goes back as
+far as the history does, and no further index is kept up to date by every commit.
 """
 
 from __future__ import annotations
@@ -95,10 +93,8 @@ class LineageDesk:
 
     def on_explain(self, message: Explain, reply_to: int) -> Iterator[Effect]:
         """Return the asked versions with their causes; forgotten ones are left out."""
-        if len(message.versions) > ASKED_MAX:
-            yield Reply(reply_to, _too_many(len(message.versions)))
-            return
-        yield Reply(reply_to, versions(self._state, self._explained(message)))
+        wrong = _too_many(len(message.versions))
+        yield Reply(reply_to, wrong or versions(self._state, self._explained(message)))
 
     def _explained(self, message: Explain) -> Iterator[Step[VersionEntry]]:
         begin, slots = max(0, message.after.number), self._state.slots
@@ -114,10 +110,8 @@ class LineageDesk:
 
     def on_find_effects(self, message: FindEffects, reply_to: int) -> Iterator[Effect]:
         """Return every known version whose cause names one of these data."""
-        if len(message.reads) > ASKED_MAX:
-            yield Reply(reply_to, _too_many(len(message.reads)))
-            return
-        yield Reply(reply_to, versions(self._state, self._effects(message)))
+        wrong = _too_many(len(message.reads))
+        yield Reply(reply_to, wrong or versions(self._state, self._effects(message)))
 
     def _effects(self, message: FindEffects) -> Iterator[Step[VersionEntry]]:
         wanted = {(read.slot, read.stamp_ns) for read in message.reads}
@@ -161,7 +155,9 @@ class LineageDesk:
         )
 
 
-def _too_many(count: int) -> Refused:
+def _too_many(count: int) -> Refused | None:
+    if count <= ASKED_MAX:
+        return None
     return Refused("value", f"{count} were asked about at once; at most {ASKED_MAX}")
 
 
@@ -257,9 +253,7 @@ class HistoryDesk:
 
     def _keep_each(self, label: str, versions: tuple[SlotVersion, ...]) -> tuple[SlotVersion, ...]:
         """Keep versions; return those that are forgotten, or are about to be."""
-        undecided = [writes for _, writes in self._state.commits.undecided()]
-        undecided += [record.writes for record in self._prepares.undecided()]
-        changing = {write.slot for writes in undecided for write in writes}
+        changing = {write.slot for _, writes in self._prepares.undecided() for write in writes}
         slots, forgotten = self._state.slots, []
         for version in versions:
             going = version.slot in changing and self._is_going(version)

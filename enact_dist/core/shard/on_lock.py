@@ -276,7 +276,8 @@ class LockDesk:
         if datum is None:
             guard = self._state.guard
             refusal = guard.may_not_read(message.slot) if guard is not None else None
-            datum = self._current(message)
+            content = self._state.slots[message.slot]
+            datum = content.datum if content.version == message.version else None
         if refusal is not None:
             yield Reply(reply_to, refusal)
             return
@@ -313,10 +314,6 @@ class LockDesk:
             if key in pins:
                 return pins[key]
         return None
-
-    def _current(self, message: Fetch) -> Datum | None:
-        content = self._state.slots[message.slot]
-        return content.datum if content.version == message.version else None
 
     def on_release(self, message: Release, reply_to: int) -> Iterable[Effect]:
         """Give up a lock, its place and its pins; always answered."""

@@ -64,7 +64,7 @@ from enact_dist.terms import Durability
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterable, Iterator
 
-    from enact_dist.core.protocol.messages import Cause
+    from enact_dist.core.protocol.messages import Cause, WriteItem
     from enact_dist.core.protocol.records import ShardReturned
     from enact_dist.core.shard.state import ShardState
     from enact_dist.core.state.tenure import Tenure
@@ -332,13 +332,15 @@ class PrepareDesk:
         others = () if forced_ns is None else (forced_ns,)
         return min((*self._ask_ns.values(), *others), default=None)
 
-    def undecided(self) -> Iterator[PreparedRecord]:
-        """Yield what is prepared, or about to be, and not decided as far as is known here."""
-        yield from (work.record for work in self._at_store.values())
-        for lock in self._ask_ns:
-            record = self._state.tenures.by_lock[lock].prepared
-            if record is not None:
-                yield record
+    def undecided(self) -> list[tuple[int, tuple[WriteItem, ...]]]:
+        """Return stamps and writes of the commits that are not decided as far as is known here.
+
+        The store works on them, or they are prepared for another shard's decision, or about to be.
+        """
+        records = [work.record for work in self._at_store.values()]
+        tenures = map(self._state.tenures.by_lock.__getitem__, self._ask_ns)
+        records += [one.prepared for one in tenures if one.prepared is not None]
+        return [*self._state.commits.undecided(), *((one.stamp_ns, one.writes) for one in records)]
 
     # ---------------------------------------------------------------- people
 

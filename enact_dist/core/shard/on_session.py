@@ -220,25 +220,18 @@ class SessionDesk:
         self._state.pins.drop_older(message.session, lowest)
         if self._state.standing.by_lane:
             yield from self._state.standing.drop_session(message.session, lowest)
+        now_ns, numbers = (
+            self._state.now_ns,
+            (session.count_seen, self._state.commits.notice_number),
+        )
         grants = tuple(
             [
-                GrantLeft(
-                    tenure.lock, tenure.token, max(0, tenure.hold_end_ns - self._state.now_ns)
-                )
+                GrantLeft(tenure.lock, tenure.token, max(0, tenure.hold_end_ns - now_ns))
                 for tenure in self._state.tenures.of_session(message.session)
                 if tenure.token is not None
             ]
         )
-        yield Reply(
-            reply_to,
-            Alive(
-                self._state.epoch,
-                session.count_seen,
-                self._state.commits.notice_number,
-                self._state.stamp(),
-                grants,
-            ),
-        )
+        yield Reply(reply_to, Alive(self._state.epoch, *numbers, self._state.stamp(), grants))
 
     def on_goodbye(self, message: Goodbye, reply_to: int) -> Iterator[Effect]:
         """End a session at its own wish."""

@@ -40,7 +40,7 @@ from enact_dist.terms import ACCESSES
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
-    from enact_dist.core.protocol.messages import Item, WriteItem
+    from enact_dist.core.protocol.messages import Item
     from enact_dist.core.protocol.records import Effect
     from enact_dist.core.shard.on_lock import LockDesk
     from enact_dist.core.shard.on_prepare import PrepareDesk
@@ -206,7 +206,7 @@ class ViewDesk:
 
     def _undecided_ns(self, items: tuple[Item, ...]) -> int:
         """Return the smallest stamp that an undecided commit on these items may get."""
-        undecided = self._undecided()
+        undecided = self._prepares.undecided()
         if not undecided:
             return _NEVER_NS
         slots = {Slot(i.context, i.entity, i.aspect) for i in items if not ACCESSES[i.access].each}
@@ -240,8 +240,7 @@ class ViewDesk:
     def answer_parked(self, *, decided: bool) -> Iterator[Effect]:
         """Answer the views that waited enough, or that nothing undecided stands before any more.
 
-        Args:
-            decided: Whether a commit may have been decided since the last time.
+        Nothing was decided since the last time unless `decided`.
         """
         if self._state.draining:
             for reply_to, message in self._parked.all():
@@ -249,7 +248,7 @@ class ViewDesk:
         for reply_to, message in self._parked.ended(self._state.now_ns):
             yield self._answer(reply_to, message)
         if decided:
-            undecided = {stamp_ns for stamp_ns, _ in self._undecided()}
+            undecided = {stamp_ns for stamp_ns, _ in self._prepares.undecided()}
             for stamp_ns in sorted(self._behind.keys() - undecided):
                 for reply_to in self._behind.pop(stamp_ns):
                     del self._behind_of[reply_to]
@@ -263,11 +262,6 @@ class ViewDesk:
             if not self._behind[stamp_ns]:
                 del self._behind[stamp_ns]
         return Reply(reply_to, self._dropped(message) or self._viewed(message))
-
-    def _undecided(self) -> list[tuple[int, tuple[WriteItem, ...]]]:
-        """Return stamps and writes of the commits that are not decided."""
-        prepared = ((record.stamp_ns, record.writes) for record in self._prepares.undecided())
-        return [*self._state.commits.undecided(), *prepared]
 
     def _dropped(self, message: TakeView) -> Refused | EpochChanged | None:
         """Refuse a view whose session, or one of whose contexts, ended while it waited.
@@ -338,9 +332,8 @@ class StampDesk:
 
     def _shown_ns(self) -> int:
         """Return the stamp up to which every commit is visible."""
-        undecided = [stamp_ns for stamp_ns, _ in self._state.commits.undecided()]
-        undecided += [record.stamp_ns for record in self._prepares.undecided()]
-        return min([self._state.stamp(), *(stamp_ns - 1 for stamp_ns in undecided)])
+        undecided = self._prepares.undecided()
+        return min([self._state.stamp(), *(stamp_ns - 1 for stamp_ns, _ in undecided)])
 
     def next_deadline_ns(self) -> int | None:
         """Return when the next wait is over."""

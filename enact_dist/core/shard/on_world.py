@@ -162,18 +162,15 @@ class WorldDesk:
 
     def _undecided(self, message: Fork) -> bool:
         """Whether a commit on the source is undecided that may get a stamp up to the asked one."""
-        undecided = list(self._state.commits.undecided())
-        undecided += [(record.stamp_ns, record.writes) for record in self._prepares.undecided()]
         return any(
             stamp_ns <= message.at_ns and any(w.slot.context == message.source for w in writes)
-            for stamp_ns, writes in undecided
+            for stamp_ns, writes in self._prepares.undecided()
         )
 
     def answer_waiting(self, *, decided: bool) -> Iterator[Effect]:
         """Make the forks that nothing undecided stands before now; refuse the others in time.
 
-        Args:
-            decided: Whether a commit may have been decided since the last time.
+        Nothing was decided since the last time unless `decided`.
         """
         due_ns = self.next_deadline_ns()
         if not decided and not self._state.draining and (due_ns or 0) > self._state.now_ns:

@@ -26,11 +26,7 @@ PLACE_CHARACTERS_MAX: Final = 256
 
 
 class PlaceDesk:
-    """The places of all shards of the cell.
-
-    Args:
-        state: Of the shard.
-    """
+    """The places of all shards of the cell."""
 
     def __init__(self, state: ShardState) -> None:
         self._state = state

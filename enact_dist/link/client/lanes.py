@@ -66,7 +66,7 @@ class Lanes:
         self._made = 0
 
     def take(self) -> int:
-        """Return a lane that no live lock uses.
+        """Return a lane that no live lock uses; append it to `free` once, when its lock is over.
 
         Raises:
             MisuseError: The session already holds or awaits its maximum of locks.
@@ -85,10 +85,6 @@ class Lanes:
                 )
             self._made += 1
             return self._made - 1
-
-    def give_back(self, lane: int) -> None:
-        """Free the lane; call once per `take`, or two locks would share it."""
-        self.free.append(lane)
 
     def keep(self, lane: int) -> None:
         """Keep the outcome of a lane for a while; frees the oldest such lane."""

@@ -135,7 +135,7 @@ class CellClient(SessionClient):
             if lock is not None:
                 self.release(lock)
             else:
-                self._lanes.give_back(lane)
+                self._lanes.free.append(lane)
             raise
 
     def _ask(self, lane: int, asked: WantedLock) -> MultiLock:

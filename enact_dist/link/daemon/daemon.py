@@ -264,10 +264,6 @@ class RunningShard:
                 self._shared.close()
             self._ended.set()
 
-    def stop_now(self) -> None:
-        """End the wait of a drain."""
-        self.host.stop_now()
-
     def _name_holders(self, drain_s: float) -> None:
         held = []
         calls = Calls([(self.settings.shard.name, ListLocks())])

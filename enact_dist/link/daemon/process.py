@@ -90,7 +90,7 @@ def _serve(
     """Serve until a signal, a failure, or a request to give the shard to a standby."""
     try:
         signals.call(lambda word: None if shard.wait(0) else _stop(shard, word, manager))
-        signals.call_again(lambda _: shard.stop_now())
+        signals.call_again(lambda _: shard.host.stop_now())
         shard.host.each_tick(lambda: manager.alive(shard.host.state))
         _say_ready(shard, formatter)
         manager.ready(shard.host.state)

@@ -74,7 +74,7 @@ class ShardCalls:
         self.keys = keys
         self._cell, self._identity, self._lease_s = cell, shard_identity(name), lease_s
         self._endpoints = {shard.name: shard.endpoints for shard in shards if shard.name != name}
-        self._answered, self._returned = answered, returned
+        self.pass_answer, self.pass_return = answered, returned
         self._mutex = threading.Lock()
         self._lines: dict[str, _Line] = {}
         self._unknown: dict[str, None] = {}
@@ -109,14 +109,6 @@ class ShardCalls:
     def key_of(self, shard: str, request: Request) -> str:
         """Return the key of a request of this shard to another one."""
         return request_key(self._cell, shard, verb_of(request), self._identity)
-
-    def pass_answer(self, shard: str, request: Request, answer: Answer) -> None:
-        """Pass on an answer."""
-        self._answered(shard, request, answer)
-
-    def pass_return(self, shard: str) -> None:
-        """Report that a shard is within reach."""
-        self._returned(shard)
 
     def _log_unknown(self, shard: str) -> None:
         """Log once that a lock was prepared with a shard that the cell no longer has."""
