@@ -155,7 +155,7 @@ def test_second_signal_cuts_off_all_that_still_run():
         actors.group._drains_s = dict.fromkeys(actors.begun, 3600.0)
         actors.until(lambda: actors.ready)
         actors.group.end("SIGTERM")
-        actors.group.hurry("SIGTERM")
+        actors.group.stop_now("SIGTERM")
         actors.until(lambda: actors.left)
 
     assert actors.left[0] == 1

@@ -115,13 +115,13 @@ class ClientBench:
             lock.answered(shard, request, answer, self.cell.now_ns)
 
     def drive(self, lock: MultiLock, *, steps: int = 60) -> MultiLock:
-        """Make the lock's calls until it rests, then send its farewells."""
+        """Make the lock's calls until it rests, then send its releases."""
         for _ in range(steps):
             if not lock.phase.busy:
                 break
             self.step(lock)
-        for shard, farewell in lock.take_farewells():
-            self._answer(shard, farewell)
+        for shard, release in lock.take_releases():
+            self._answer(shard, release)
         return lock
 
     def locked(self, *items: Item, **options: float) -> MultiLock:

@@ -68,9 +68,9 @@ class User:
         if grant is not None and grant.token.number in self.marks.cells.get("ann", ()):
             self.core.kept.put_back(grant)
         elif grant is not None:
-            lock.farewells.append(("s0", Release(grant.origin)))
-        for shard, farewell in lock.take_farewells():
-            self.client._answer(shard, farewell)
+            lock.releases.append(("s0", Release(grant.origin)))
+        for shard, release in lock.take_releases():
+            self.client._answer(shard, release)
         return grant
 
     def write(self, lock, text: str | None = "1"):

@@ -146,8 +146,8 @@ class FastClient:
                 if dies_before is not None and isinstance(request, dies_before):
                     return lock
                 lock.answered(shard, request, cell.ask(shard, request), cell.now_ns)
-        for shard, farewell in lock.take_farewells():
-            cell.ask(shard, farewell)
+        for shard, release in lock.take_releases():
+            cell.ask(shard, release)
         return lock
 
 

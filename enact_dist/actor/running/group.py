@@ -128,7 +128,7 @@ class Life:
         if doing is not None:
             self._drain(doing, why)
 
-    def hurry(self, _why: str) -> None:
+    def stop_now(self, _why: str) -> None:
         """Cut the actor off now."""
         if self._doing is not None:
             self._cut_off(self._doing, "received a second signal")
@@ -268,12 +268,12 @@ class ActorGroup:
         for life in lives:
             life.end(why)
 
-    def hurry(self, why: str) -> None:
+    def stop_now(self, why: str) -> None:
         """Cut off all actors that still run."""
         with self._changed:
             lives = list(self._lives.values())
         for life in lives:  # each may block on a log without a reader
-            threading.Thread(target=life.hurry, args=(why,), daemon=True).start()
+            threading.Thread(target=life.stop_now, args=(why,), daemon=True).start()
 
     def _keep(self, name: str) -> None:
         """Run an actor, and run it again, in its thread."""

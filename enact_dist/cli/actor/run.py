@@ -76,7 +76,7 @@ def _run_one(options: argparse.Namespace, process: ActorProcess | None, leaving:
     with StopSignals() as signals:
         for act in (lambda _: manager.stopping(), life.end):
             signals.call(act)
-        signals.call_again(life.hurry)
+        signals.call_again(life.stop_now)
         status = _lived(options, made, life, formatter)
     if status or signals.count:  # else it is done, and what it has started may go on
         leaving.within(made.drain_s, status or CUT_OFF)
@@ -116,7 +116,7 @@ def _run_group(options: argparse.Namespace, process: ActorProcess, leaving: Leav
     with StopSignals() as signals:
         for act in (lambda _: manager.stopping(), group.end):
             signals.call(act)
-        signals.call_again(group.hurry)
+        signals.call_again(group.stop_now)
         status = group.run()
     if status or signals.count:
         leaving.within(max(drains_s.values()), status or CUT_OFF)
@@ -150,7 +150,7 @@ def _lived(
             statistics = _run(run, ready)
     life.over()
     counted = {key: getattr(statistics, key) for key in ("state", "updates", "failures", "refused")}
-    say(formatter, "actor.end", _farewell(name, statistics), **counted)
+    say(formatter, "actor.end", _end_line(name, statistics), **counted)
     return ANEW if restarts.is_set() else DONE
 
 
@@ -370,7 +370,7 @@ def _listed(names: Iterable[str]) -> str:
     return ", ".join(names) or "none"
 
 
-def _farewell(name: str, statistics: ActorStatistics) -> str:
+def _end_line(name: str, statistics: ActorStatistics) -> str:
     error = f"; last error: {statistics.last_error}" if statistics.last_error else ""
     return (
         f"{statistics.state}: actor {name} after {statistics.updates} updates,"

@@ -98,7 +98,7 @@ class MultiLock:
     parts: list[Part] = field(default_factory=list)
     slice_ns: int = WAIT_SLICE_NS
     lane_free: bool = False
-    farewells: list[tuple[str, Request]] = field(default_factory=list)
+    releases: list[tuple[str, Request]] = field(default_factory=list)
     cut: Cut | None = None
     unnamed: bool = False  # its bytes travel: the shard has lost the payloads that it named
     keeping: Keeping | None = None  # if its grant may stay with the session
@@ -161,10 +161,10 @@ class MultiLock:
             self.lock, self.plan, part, news, now_ns=now_ns, wait_ns=wait_ns, hold_ns=hold_ns
         )
 
-    def take_farewells(self) -> list[tuple[str, Request]]:
+    def take_releases(self) -> list[tuple[str, Request]]:
         """Return releases to send once; their answers do not matter, and lost ones are repaired."""
-        farewells, self.farewells = self.farewells, []
-        return farewells
+        releases, self.releases = self.releases, []
+        return releases
 
     # ---------------------------------------------------------------- what came back
 
@@ -374,7 +374,7 @@ class MultiLock:
             self.finishing.writes = {}  # they may be large, and the program may keep the lock
         if phase not in (Phase.COMMITTED, Phase.UNKNOWN):
             touched = dict.fromkeys([*(part.shard for part in self.parts), *dict(self.plan.views)])
-            self.farewells += [(shard, Release(self.lock)) for shard in touched]
+            self.releases += [(shard, Release(self.lock)) for shard in touched]
         self.client.ended(self)
 
     # ---------------------------------------------------------------- the end
@@ -434,7 +434,7 @@ class MultiLock:
         else:
             if not self.parts and any(r.state.large or r.state.same for r in self.states):
                 # The shards keep large data of a lock of views alone.
-                self.farewells += [(shard, Release(self.lock)) for shard, _ in self.plan.views]
+                self.releases += [(shard, Release(self.lock)) for shard, _ in self.plan.views]
             self._end(Phase.COMMITTED)
 
     def _on_vote(self, shard: str, answer: Answer) -> None:

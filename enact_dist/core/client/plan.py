@@ -49,7 +49,7 @@ class Phase(enum.Enum):
 
 
 OUTSIDE_NS: Final = 60_000_000_000
-"""While a lock waits for news its shard has to answer within this time, beside its patience."""
+"""So much longer, beside its time in the queue, may a shard keep a lock that waits for news."""
 OF_SESSIONS: Final = frozenset((Welcome, Alive, EpochChanged))
 """The answers that tell something about a session and not only about one lock."""
 
@@ -86,20 +86,20 @@ class AwaitedNews:
 
     Attributes:
         seen: Data of its slots that were seen; anything newer is news.
-        patience_ns: How long it may stay in the queue.
+        wait_ns: How long it may stay in the queue.
         outside: Whether it has no place in the queue yet, as far as is known.
     """
 
     seen: tuple[DatumRead, ...]
-    patience_ns: int
+    wait_ns: int
     outside: bool = True
 
     def give_up_ns(self, answer: Waiting, now_ns: int) -> int | None:
         """Return until when to go on after an answer; None where it stood in the queue before."""
         before, self.outside = self.outside, answer.place == NO_PLACE
         if self.outside:
-            return now_ns + self.patience_ns + OUTSIDE_NS
-        return now_ns + self.patience_ns if before else None
+            return now_ns + self.wait_ns + OUTSIDE_NS
+        return now_ns + self.wait_ns if before else None
 
 
 def first_asking(parts: Iterable[Part]) -> Part | None:

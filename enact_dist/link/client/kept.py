@@ -117,7 +117,7 @@ class KeptUses:
             if page.lives(grant.place, number):
                 self._core.kept.put_back(grant)
             else:
-                lock.farewells.append((part.shard, Release(grant.origin)))
+                lock.releases.append((part.shard, Release(grant.origin)))
 
     def repair(self) -> None:
         """Give back the marks that no lock has: an interrupt has cut off its end.

@@ -142,7 +142,7 @@ class CellClient(SessionClient):
         """Ask for a lock, as often as it takes, until it is held or cannot be."""
         core, begun, interrupt = self.core, asked.begun, asked.interrupt
         lock_views, started_ns, give_up_ns = False, self._now_ns(), asked.give_up_ns
-        patience_ns, attempt = max(0, give_up_ns - started_ns), -1
+        allowed_ns, attempt = max(0, give_up_ns - started_ns), -1
         while True:
             attempt += 1
             with self._mutex:
@@ -151,7 +151,7 @@ class CellClient(SessionClient):
                 wait_ns, hold_ns = max(0, give_up_ns - now_ns), asked.hold_ns
                 lock = core.begin(lane, plan, now_ns=now_ns, wait_ns=wait_ns, hold_ns=hold_ns)
                 if asked.after and len(plan.locks) == 1 and not plan.views:
-                    lock.news = AwaitedNews(asked.after, patience_ns)
+                    lock.news = AwaitedNews(asked.after, allowed_ns)
                 begun.append(lock)
                 keeps = asked.keep and plan.keepable and not lock_views
                 if keeps and self.payloads.keeps(plan.locks[0][0]):
@@ -165,8 +165,8 @@ class CellClient(SessionClient):
                 return lock
             if lock.news is not None:  # its time begins when it enters the queue
                 attempt = 0 if lock.news.outside else attempt
-                started_ns = self._now_ns() if lock.news.outside else lock.give_up_ns - patience_ns
-                give_up_ns = started_ns + patience_ns
+                started_ns = self._now_ns() if lock.news.outside else lock.give_up_ns - allowed_ns
+                give_up_ns = started_ns + allowed_ns
             over = attempt > 0 and self._now_ns() >= give_up_ns
             if over or not self._begins_anew(lock, attempt):
                 break
@@ -273,8 +273,8 @@ class CellClient(SessionClient):
                 lock.release()
             raise
         finally:
-            if lock.farewells:
-                self._say_farewell(lock)
+            if lock.releases:
+                self._send_releases(lock)
 
     def _wait_until(
         self, lock: MultiLock, until_ns: int, returns: int, interrupt: threading.Event | None
@@ -297,12 +297,12 @@ class CellClient(SessionClient):
         named = stage(self, {shard: request.writes}, self.check_usable)
         return replace(request, writes=tuple(named[shard]))
 
-    def _say_farewell(self, lock: MultiLock) -> None:
+    def _send_releases(self, lock: MultiLock) -> None:
         """Send the releases of a lock that rests; keep-alives repair lost ones."""
         with self._mutex:
-            farewells = lock.take_farewells()
+            releases = lock.take_releases()
         try:
-            self.carrier.request_all(farewells, timeout_s=CALL_S)
+            self.carrier.request_all(releases, timeout_s=CALL_S)
         except EnactError as error:
             self.count("releases_unsent")
             _log.info("lock %s was not released by message: %s", lock.lock, error)
@@ -432,8 +432,8 @@ class CellClient(SessionClient):
                     lock.release()
             if lock.keeping is not None:
                 self._kept.leave(lock)
-            if lock.farewells:
-                self._say_farewell(lock)
+            if lock.releases:
+                self._send_releases(lock)
         finally:
             lock.lane_free = True
             if lock.phase is Phase.UNKNOWN:

@@ -300,8 +300,8 @@ class ClientNode(Host):
             self._check_beliefs(self)
         if lock.phase is not Phase.HELD:
             yield from self.kept.leave(lock)
-        for shard, farewell in lock.take_farewells():
-            self.call(shard, farewell, lambda _answer: None)
+        for shard, release in lock.take_releases():
+            self.call(shard, release, lambda _answer: None)
 
     def dies(self) -> None:
         """End silently: nothing is sent any more."""
