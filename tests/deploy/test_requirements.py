@@ -92,11 +92,13 @@ def pip_lines():
         file for folder in folders for kind in ("md", "py") for file in folder.rglob(f"*.{kind}")
     ]
     for file in (ROOT / "README.md", *files):
-        for what in re.findall(
-            r"""pip install (?:-e )?['"]?([^\s'"`)]*)""", file.read_text("utf-8")
-        ):
-            if what.startswith(("enact", ".", "/")) or "[" in what:
-                yield str(file.relative_to(ROOT)), what
+        text, place = file.read_text("utf-8"), str(file.relative_to(ROOT))
+        for what in re.findall(r"""pip install (?:-e )?['"]?([^\s'"`)]*)""", text):
+            named = what.startswith(("enact", ".", "/")) or "[" in what
+            if named and "{extra}" not in what:  # `enact_dist.extras` fills in what a call names
+                yield place, what
+        for extra in re.findall(r"""\b(?:require|needing)\("[^"]+", "([^"]+)\"""", text):
+            yield place, f".[{extra}]"
 
 
 def test_every_pip_line_works_from_a_clone():
@@ -104,7 +106,8 @@ def test_every_pip_line_works_from_a_clone():
     extras = PROJECT["project"]["optional-dependencies"].keys()
     found = list(pip_lines())
 
-    assert {"README.md", "enact_dist/operate/doctor.py"} <= {place for place, _ in found}
+    asking = {"README.md", "enact_dist/operate/doctor.py", "enact_dist/cli/demo/workcell.py"}
+    assert asking <= {place for place, _ in found}
     for place, what in found:
         path, _, wanted = what.rstrip("]").partition("[")
         assert path in {".", "/path/to/enact-dist"}, (place, what)
