@@ -10,7 +10,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 
 from engine import ROOT, NoEngineError, start
-from stack import PACKAGES, judged
+from stack import PACKAGES, judged, list_cell
 
 
 @pytest.fixture(scope="session")
@@ -51,11 +51,8 @@ def build(option, engine):
 def alone(tmp_path_factory):
     """The palletizing cell on this machine, without containers; its report once it is done."""
     out = tmp_path_factory.mktemp("alone")
-    run = "import pathlib, sys; from actors.palletizing.demo.run import run_demo"
-    run += "; sys.exit(run_demo(out=pathlib.Path(sys.argv[1]), packages=int(sys.argv[2])))"
-    with subprocess.Popen(
-        [sys.executable, "-c", run, str(out), str(PACKAGES)], stdout=subprocess.PIPE, text=True
-    ) as process:
+    command = [sys.executable, list_cell.__file__, str(out), str(PACKAGES)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
 
         @functools.cache
         def report():

@@ -1,9 +1,13 @@
 """A compose project of the palletizing cell, as the tests run it."""
 
 import json
+import sys
 import time
+from pathlib import Path
 
-from actors.palletizing.demo.cell import TEMPLATE
+sys.path.append(str(Path(__file__).parents[1] / "actors" / "palletizing"))
+
+import list_cell
 
 PACKAGES = 4
 WAIT_S = 180.0
@@ -104,12 +108,7 @@ def until(found, missed, *, within_s=WAIT_S):
 def cell_file(folder):
     """Write the shipped cell with few packages."""
     file = folder / "cell.toml"
-    text = TEMPLATE.read_text("utf-8")
-    file.write_text(
-        text.replace("packages = 12", f"packages = {PACKAGES}").replace(
-            "packages=12", f"packages={PACKAGES}"
-        )
-    )
+    file.write_text(list_cell.shipped(PACKAGES))
     return file
 
 

@@ -22,6 +22,7 @@ import contextlib
 import importlib.util
 import sys
 import time
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from actors.geometry.files import write_whole
@@ -35,9 +36,8 @@ from actors.palletizing.demo.packing_report import (
     score_of,
     table_of,
 )
-from actors.palletizing.demo.report import difference_of
 from actors.palletizing.demo.robot_cell import RunningRobotCell, watched_robot_cell
-from actors.palletizing.demo.run import watch_demo
+from actors.palletizing.demo.run import WATCHING, show_run, show_score, watch_demo
 from actors.palletizing.operator import SCRIPT
 from actors.palletizing.vocabulary import (
     CONTROL,
@@ -51,12 +51,11 @@ from actors.palletizing.vocabulary import (
     RESULTS,
     ROBOT,
     SCAN,
-    STANDING,
     SYSTEM,
     USER,
     VIEWS,
 )
-from actors.running_cell import DemoError, recording, until_interrupted
+from actors.running_cell import DemoError, recording
 from enact_dist import View, ViewEach
 from enact_dist.errors import ShardUnreachableError
 
@@ -114,10 +113,9 @@ def run_packing(
     if not 0.1 <= speed <= 10.0:
         print(f"--speed is {speed:g}; it must be between 0.1 and 10", file=sys.stderr)
         return 1
-    out.mkdir(parents=True, exist_ok=True)
     running = RunningRobotCell(out, packages=packages, seed=seed, speed=speed, store=store)
     up = f"cell up: 2 shards, 16 actors, and physics at {speed:g} times real time"
-    return show_cell(running, out, up=up, keep_running=keep_running)
+    return show_run(running, out, up, partial(_show, running, out), stays=keep_running)
 
 
 def watch_packing(config: Path, *, out: Path) -> int:
@@ -136,47 +134,21 @@ def watch_packing(config: Path, *, out: Path) -> int:
     running = watched_robot_cell(config)
     if running is None:
         return watch_demo(config, out=out)
-    out.mkdir(parents=True, exist_ok=True)
-    return show_cell(running, out, up="watching a cell that runs already", keep_running=False)
+    return show_run(running, out, WATCHING, partial(_show, running, out))
 
 
-def show_cell(demo: RobotCell | RunningRobotCell, out: Path, *, up: str, keep_running: bool) -> int:
-    """Show a run and write its files; return the exit status.
-
-    Args:
-        demo: The cell.
-        out: Folder for the files; it exists.
-        up: What is said when the cell is up.
-        keep_running: Leave the cell up afterwards, until Ctrl-C.
-    """
-    from rich.console import Console
-
-    console = Console(highlight=False)
-    started_s = time.monotonic()
-    try:
-        with demo as running, running.joined() as cell:
-            console.print(f"{up}; log in {running.log}")
-            with _recorded(cell, out, console):
-                seen = follow(cell, running, console)
-            rows = _rows(cell, running, seen)
-            console.print("\n", table_of(rows), f"\n{score_of(rows)}", sep="")
-            console.print(_told(seen))
-            planned = cell.world("training").diff(cell.world("online"), PLACES, [STANDING])
-            console.print("", difference_of(planned), "", sep="\n")
-            show_packing(cell, console)
-            contents, left_out = files_of(cell, running.config, out, seen)
-            contents[out / "report.json"] = report_bytes(rows, seen.figures)
-            _write(out, contents)
-            for line in left_out:
-                console.print(line)
-            console.print(f"pictures in {out}; {time.monotonic() - started_s:.0f} s in all")
-            if keep_running:
-                console.print(f"the cell stays up: enact world tree --cell {running.config}")
-                until_interrupted(running)
-    except (DemoError, ControllerError) as error:
-        print(f"enact demo: {error}", file=sys.stderr)
-        return 1
-    return 0
+def _show(running: RobotCell | RunningRobotCell, out: Path, cell: Cell, console: Console) -> None:
+    """Show a run and write its files."""
+    with _recorded(cell, out, console):
+        seen = follow(cell, running, console)
+    rows = _rows(cell, running, seen)
+    show_score(cell, table_of(rows), f"{score_of(rows)}\n{_told(seen)}", console)
+    show_packing(cell, console)
+    contents, left_out = files_of(cell, running.config, out, seen)
+    contents[out / "report.json"] = report_bytes(rows, seen.figures)
+    _write(out, contents)
+    for line in left_out:
+        console.print(line)
 
 
 def _recorded(cell: Cell, out: Path, console: Console) -> contextlib.AbstractContextManager[Any]:

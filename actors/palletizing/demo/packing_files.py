@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from actors.geometry.pictures.picture import png_bytes
-from actors.palletizing.demo.pictures import model_picture, tray_picture
+from actors.palletizing.demo.pictures import tray_picture
+from actors.palletizing.demo.run import model_pictures
 from actors.palletizing.handling.net_picture import svg_of_net
 from actors.palletizing.handling.stages import STANDS
 from actors.palletizing.vocabulary import (
@@ -17,10 +18,8 @@ from actors.palletizing.vocabulary import (
     OBSERVATION,
     PLACES,
     PLAN,
-    PRODUCTS,
     REGION,
     ROBOT,
-    SURFACE,
     SYSTEM,
     TRAY,
 )
@@ -79,12 +78,7 @@ def files_of(
         out: Folder of the files.
         seen: What was seen while the run went on.
     """
-    contents: dict[Path, bytes] = {}
-    training = cell.world("training")
-    surfaces = ViewEach(training, PRODUCTS, SURFACE)
-    for product, surface in training.view(surfaces)[surfaces].items():
-        name = product.name.removeprefix("product/")
-        contents[out / f"model_{name}.png"] = png_bytes(model_picture(name, surface))
+    contents = model_pictures(cell, out)
     for tray, picture in _trays(cell, seen).items():
         contents[out / f"tray_{tray + 1}.png"] = png_bytes(picture)
     for name, picture in seen.pictures.items():

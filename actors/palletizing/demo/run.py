@@ -11,7 +11,6 @@ Files in `out`:
 model_<product>.png  the trained surface, each planar patch in its colour
 tray_<n>.png         each tray with the deviating regions in red
 report.json          the table
-cell.toml, cell.log  configuration and log of the cell, if it ran here
 ===================  =========================================================
 """
 
@@ -24,7 +23,8 @@ from typing import TYPE_CHECKING, Final
 
 from actors.geometry.files import write_whole
 from actors.geometry.pictures.picture import png_bytes
-from actors.palletizing.demo.cell import PalletizingCell, RunningCell, watched_cell
+from actors.palletizing.control.controller import ControllerError
+from actors.palletizing.demo.cell import watched_cell
 from actors.palletizing.demo.lineage import show_lineage
 from actors.palletizing.demo.pictures import latest, model_picture, tray_picture
 from actors.palletizing.demo.report import difference_of, report_bytes, rows_of, score_of, table_of
@@ -52,56 +52,24 @@ from enact_dist import View, ViewEach
 from enact_dist.errors import ShardUnreachableError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from rich.console import Console
+    from rich.table import Table
 
     from actors.palletizing.demo.pictures import Picture
     from actors.palletizing.demo.report import Row
     from actors.palletizing.simulation.packages import Package
     from actors.palletizing.vocabulary import Notice
-    from actors.running_cell import DemoStore
+    from actors.running_cell import DemoCell
     from enact_dist import Cell
 
 LOOK_S: Final = 0.2
 """How often the demonstration looks at the cell."""
 STALL_S: Final = 120.0
 """Without any progress for this long something is wrong; a view takes less than a second."""
-SEED: Final = 59
-"""A seed whose first twelve packages show every kind of deviation."""
-
-
-def run_demo(
-    *,
-    out: Path,
-    packages: int = 12,
-    seed: int = SEED,
-    keep_running: bool = False,
-    store: DemoStore | None = None,
-) -> int:
-    """Run the demonstration and report.
-
-    Args:
-        out: Folder for pictures and report; made if missing.
-        packages: How many packages come, at least 1.
-        seed: Seed of packages and sensors.
-        keep_running: Leave the cell up afterwards, until Ctrl-C.
-        store: Where the cell's data are instead of a folder.
-
-    Returns:
-        Exit status: 0 done, 1 the cell failed; wrong verdicts are the score's matter.
-    """
-    if packages < 1:
-        print(f"--packages is {packages}; at least one has to come", file=sys.stderr)
-        return 1
-    out.mkdir(parents=True, exist_ok=True)
-    return _shown(
-        RunningCell(out, packages=packages, seed=seed, store=store),
-        out,
-        up="cell up: 2 shards, 8 actors, each a process",
-        keep_running=keep_running,
-    )
+WATCHING: Final = "watching a cell that runs already"
 
 
 def watch_demo(config: Path, *, out: Path) -> int:
@@ -112,46 +80,82 @@ def watch_demo(config: Path, *, out: Path) -> int:
         out: Folder for pictures and report; made if missing.
 
     Returns:
-        Exit status as of `run_demo`.
+        Exit status: 0 done, 1 the cell failed; wrong verdicts are the score's matter.
 
     Raises:
         ConfigError: The file cannot be used, or is not of a simulated palletizing cell.
     """
-    running = watched_cell(config)
-    out.mkdir(parents=True, exist_ok=True)
-    return _shown(running, out, up="watching a cell that runs already", keep_running=False)
+    demo = watched_cell(config)
+    truths = package_sequence(demo.packages, seed=demo.seed)
+
+    def show(cell: Cell, console: Console) -> None:
+        _follow(cell, demo, truths, console)
+        rows = _outcome(cell, truths)
+        show_score(cell, table_of(rows), score_of(rows), console)
+        show_lineage(cell, rows[-1].product, console)
+        _write_files(cell, out, report_bytes(rows, seed=demo.seed))
+
+    return show_run(demo, out, WATCHING, show)
 
 
-def _shown(demo: PalletizingCell | RunningCell, out: Path, *, up: str, keep_running: bool) -> int:
-    """Show a run and write its files; return the exit status."""
+def show_run(
+    demo: DemoCell,
+    out: Path,
+    up: str,
+    show: Callable[[Cell, Console], None],
+    *,
+    stays: bool = False,
+) -> int:
+    """Enter a cell, let a run be shown, and return the exit status.
+
+    Args:
+        demo: The cell.
+        out: Folder for the files; made if missing.
+        up: What is said when the cell is up.
+        show: Follows the run to its end, and writes the files.
+        stays: Leave the cell up afterwards, until Ctrl-C.
+    """
     from rich.console import Console
 
+    out.mkdir(parents=True, exist_ok=True)
     console = Console(highlight=False)
     started_s = time.monotonic()
-    truths = package_sequence(demo.packages, seed=demo.seed)
     try:
         with demo as running, running.joined() as cell:
             console.print(f"{up}; log in {running.log}")
-            _follow(cell, running, truths, console)
-            rows = _outcome(cell, truths)
-            console.print("\n", table_of(rows), f"\n{score_of(rows)}", sep="")
-            planned = cell.world("training").diff(cell.world("online"), PLACES, [STANDING])
-            console.print("", difference_of(planned), "", sep="\n")
-            show_lineage(cell, rows[-1].product, console)
-            _write_files(cell, out, report_bytes(rows, seed=running.seed))
+            show(cell, console)
             console.print(f"pictures in {out}; {time.monotonic() - started_s:.0f} s in all")
-            if keep_running:
+            if stays:
                 console.print(f"the cell stays up: enact world tree --cell {running.config}")
                 until_interrupted(running)
-    except DemoError as error:
+    except (DemoError, ControllerError) as error:
         print(f"enact demo: {error}", file=sys.stderr)
         return 1
     return 0
 
 
-def _follow(
-    cell: Cell, running: PalletizingCell | RunningCell, truths: Sequence[Package], console: Console
-) -> None:
+def show_score(cell: Cell, table: Table, score: str, console: Console) -> None:
+    """Print table and score, and what is not as planned."""
+    console.print("\n", table, f"\n{score}", sep="")
+    planned = cell.world("training").diff(cell.world("online"), PLACES, [STANDING])
+    console.print("", difference_of(planned), "", sep="\n")
+
+
+def model_pictures(cell: Cell, out: Path) -> dict[Path, bytes]:
+    """Return the picture of each trained surface by its file."""
+    training = cell.world("training")
+    surfaces = ViewEach(training, PRODUCTS, SURFACE)
+    trained = {
+        product.name.removeprefix("product/"): surface
+        for product, surface in training.view(surfaces)[surfaces].items()
+    }
+    return {
+        out / f"model_{name}.png": png_bytes(model_picture(name, surface))
+        for name, surface in trained.items()
+    }
+
+
+def _follow(cell: Cell, running: DemoCell, truths: Sequence[Package], console: Console) -> None:
     """Show progress until the user was notified of every package.
 
     Raises:
@@ -183,8 +187,6 @@ def _follow(
                 if place not in told:
                     console.print(notice.text)
             told |= seen.notices.keys()
-            if line := running.progressed(len(told)):
-                console.print(line)
             for product in sorted(seen.models - trained):
                 console.print(f"{product} is trained")
             trained |= seen.models
@@ -238,12 +240,7 @@ def _outcome(cell: Cell, truths: Sequence[Package]) -> list[Row]:
 
 def _write_files(cell: Cell, out: Path, report: bytes) -> None:
     """Draw the pictures; write all files, none half, and remove those of an earlier run."""
-    training = cell.world("training")
-    contents = {out / "report.json": report}
-    surfaces = ViewEach(training, PRODUCTS, SURFACE)
-    for product, surface in training.view(surfaces)[surfaces].items():
-        name = product.name.removeprefix("product/")
-        contents[out / f"model_{name}.png"] = png_bytes(model_picture(name, surface))
+    contents = {out / "report.json": report, **model_pictures(cell, out)}
     for tray, picture in _tray_pictures(cell).items():
         contents[out / f"tray_{tray + 1}.png"] = png_bytes(picture)
     for stale in {*out.glob("tray_[0-9]*.png"), *out.glob("model_*.png")} - contents.keys():
