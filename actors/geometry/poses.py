@@ -103,6 +103,13 @@ def looking_at(eye_m: Points, target_m: Points) -> Pose:
     return pose
 
 
+def along_z(z: Points) -> npt.NDArray[np.float64]:
+    """Return a right-handed turn, (3, 3), whose z axis is a unit vector, (3,)."""
+    x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1)
+
+
 def small_motion(twist: npt.NDArray[np.float64]) -> Pose:
     """Return the rigid transform of a rotation vector (rad) and a translation (m), (6,)."""
     from scipy.spatial.transform import Rotation

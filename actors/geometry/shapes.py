@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+Values = npt.NDArray[np.floating[Any]]
+
 DEPTH_UNKNOWN_MM = 0
 """What a depth sensor reports where it has no answer."""
 
@@ -71,6 +73,10 @@ class Camera:
     def shape(self) -> tuple[int, int]:
         """Rows and columns of its images."""
         return self.height_px, self.width_px
+
+    def column_row(self, x: Values, y: Values, z: Values) -> tuple[Values, Values]:
+        """Return at which column and row, not rounded, it sees points ahead of it, metres."""
+        return x / z * self.fx_px + self.cx_px, y / z * self.fy_px + self.cy_px
 
 
 VGA = Camera(width_px=640, height_px=480, fx_px=577.0, fy_px=577.0, cx_px=319.5, cy_px=239.5)

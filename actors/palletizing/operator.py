@@ -37,11 +37,7 @@ class Hands(Protocol):
     """A person's hands, where a simulated cell has none."""
 
     def remove(self, number: int) -> None:
-        """Take a package out of the cell.
-
-        Args:
-            number: How many came before it.
-        """
+        """Take a package out of the cell."""
         ...
 
 

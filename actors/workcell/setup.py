@@ -59,9 +59,6 @@ DWELL_S: Final = 0.4
 def grid_of(voxel_m: float) -> Grid:
     """Return the grid of the watched volume.
 
-    Args:
-        voxel_m: Edge of a voxel.
-
     Raises:
         ValueError: `voxel_m` is not positive.
     """

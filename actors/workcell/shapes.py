@@ -84,9 +84,6 @@ class ShapeReconstruction(Actor):
 def frames_of(scan: str) -> Sequence[DepthFrame]:
     """Return the depth images of a scan.
 
-    Args:
-        scan: As `ShapeReconstruction` takes it.
-
     Raises:
         InputFileError: The folder holds no recording.
         ValueError: The seed is invalid.

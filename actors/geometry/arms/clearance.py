@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 SPACING_M: Final = 0.11
 """Greatest distance of two neighbouring spheres of a capsule."""
+FLOOR_M: Final = 0.03
+"""Height below which nothing of the arm may come."""
 
 
 class ArmSpheres:
@@ -184,7 +186,6 @@ class Clearance:
         spheres: Of the arm.
         arm: Its limits.
         grids: What is occupied.
-        floor_m: Height below which nothing of the arm may come.
         slack_m: How much less than that, and than the room that the arm needs beside itself, is
             enough.
     """
@@ -195,11 +196,10 @@ class Clearance:
         arm: Arm,
         grids: list[GrownGrid],
         *,
-        floor_m: float = 0.03,
         slack_m: float = 0.0,
     ) -> None:
         self._spheres, self._q_max, self._grids = spheres, np.asarray(arm.q_max), grids
-        self._floor_m = spheres.radius_m[spheres.moves] + floor_m - slack_m
+        self._floor_m = spheres.radius_m[spheres.moves] + FLOOR_M - slack_m
         self._slack_m = slack_m
 
     def free(self, q_rad: F64) -> npt.NDArray[np.bool_]:

@@ -137,14 +137,7 @@ def _turn(start_rad: F64, goal_rad: F64, heading: F64, free: Free) -> tuple[F64 
 
 
 def shortened(waypoints: F64, free: Free, *, seed: int, limit_s: float) -> F64:
-    """Return a path that goes straight where it can.
-
-    Args:
-        waypoints: (k, n), free.
-        free: As for `plan`.
-        seed: Of the draws.
-        limit_s: Longest time to take.
-    """
+    """Return a path that goes straight where it can."""
     draw = np.random.default_rng(seed)
     end_s, idle = time.monotonic() + limit_s, 0
     while len(waypoints) > 2 and idle < 4 and time.monotonic() < end_s:

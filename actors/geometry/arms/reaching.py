@@ -28,6 +28,8 @@ STEP_RAD: Final = 0.3
 DAMPING: Final = 1e-4
 OTHERS: Final = 15
 """Random states that are tried together."""
+KEPT_RAD: Final = 0.03
+"""Free before the ends of the joints' ranges."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,22 +54,20 @@ class Reached:
         return self.off_m <= NEAR_M and self.off_rad <= NEAR_RAD
 
 
-def reach(arm: Arm, pose: F64, near_rad: F64, *, seed: int = 0, kept_rad: float = 0.03) -> Reached:
+def reach(arm: Arm, pose: F64, near_rad: F64) -> Reached:
     """Return joints with which the tool comes to a pose, or as near as was found.
 
     Args:
         arm: Kinematics and ranges.
         pose: (4, 4), cell_from_tool, metres.
         near_rad: (n,), where the arm is; the search begins there.
-        seed: Of the random states.
-        kept_rad: Free before the ends of the joints' ranges.
     """
-    most = np.asarray(arm.q_max, np.float64) - kept_rad
+    most = np.asarray(arm.q_max, np.float64) - KEPT_RAD
     start = np.clip(np.asarray(near_rad, np.float64), -most, most)[None]
     found = _descended(arm, pose, start, most, nearby=True)
     if found.there:
         return found
-    random = np.random.default_rng(seed).uniform(-0.9, 0.9, (OTHERS, len(most))) * most
+    random = np.random.default_rng(0).uniform(-0.9, 0.9, (OTHERS, len(most))) * most
     other = _descended(arm, pose, random, most, nearby=False)
     return other if _cost(other.off_m, other.off_rad) < _cost(found.off_m, found.off_rad) else found
 

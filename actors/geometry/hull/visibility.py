@@ -118,11 +118,7 @@ class CameraTable:
         return -(-self.height // POOL_PX), -(-self.width // POOL_PX)
 
     def cell_of_pixel(self, pixel: npt.NDArray[np.integer]) -> npt.NDArray[np.int64]:
-        """Return in which cell of the pooled masks pixels lie.
-
-        Args:
-            pixel: Flat indices into one mask.
-        """
+        """Return in which cell of the pooled masks pixels lie."""
         row, column = np.divmod(pixel, self.width)
         return np.asarray(row // POOL_PX * self.pool_shape[1] + column // POOL_PX, np.int64)
 

@@ -51,11 +51,7 @@ BITS_SET: Final = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1)
 
 
 class Masks:
-    """One camera's silhouette as its table looks it up: grown, pooled, with sentinels.
-
-    Args:
-        table: Of the camera.
-    """
+    """One camera's silhouette as its table looks it up: grown, pooled, with sentinels."""
 
     def __init__(self, table: CameraTable) -> None:
         self._table = table
@@ -125,9 +121,6 @@ class Masks:
     def unexplained(self, pixels: Rows) -> npt.NDArray[np.uint8]:
         """Return which cells show something, and have none of these pixels in or beside them.
 
-        Args:
-            pixels: Flat indices into one mask.
-
         Returns:
             `pool_shape` of the table, uint8, 0 or 1.
         """
@@ -189,11 +182,7 @@ class VisualHull:
         self._given = tuple(given)
 
     def carve(self, blocks: Rows) -> npt.NDArray[np.int64]:
-        """Return the rows of all voxels of some blocks that no camera says to be free.
-
-        Args:
-            blocks: Numbers of blocks, each once.
-        """
+        """Return the rows of all voxels of some blocks that no camera says to be free."""
         for number in self._given:
             cells, table = self._masks[number].cells, self.tables[number]
             blocks = blocks[cells[table.cell[blocks]] > 0]
@@ -311,11 +300,7 @@ class VisualHull:
         return result
 
     def tight(self, rows: Rows) -> npt.NDArray[np.bool_]:
-        """Return which voxels have their centre in every silhouette, as it came.
-
-        Args:
-            rows: Any voxels.
-        """
+        """Return which voxels have their centre in every silhouette, as it came."""
         return self._centres(rows, FOREGROUND)
 
     def dark(self, rows: Rows) -> npt.NDArray[np.bool_]:

@@ -19,23 +19,24 @@ if TYPE_CHECKING:
 
 
 def voxel_surface(
-    occupied: npt.NDArray[np.bool_], origin_m: Numbers, voxel_m: float, *, smooth: bool = True
+    occupied: npt.NDArray[np.bool_], origin_m: Numbers, voxel_m: float
 ) -> tuple[Numbers, npt.NDArray[np.int32]]:
     """Return the surface of voxels.
+
+    Vertices lie on the border of the occupancy averaged over 3 x 3 x 3 voxels, at most half a voxel
+    from where they lay else.
 
     Args:
         occupied: (I, J, K).
         origin_m: (3,), lowest corner of the grid, metres.
         voxel_m: Edge of a voxel.
-        smooth: Vertices lie on the border of the occupancy averaged over 3 x 3 x 3 voxels, at most
-            half a voxel from where they lay else.
 
     Returns:
         Vertices (V, 3), metres, and triangles (T, 3).
     """
     padded = np.pad(occupied, 2)
     level = np.where(padded, 1.0, -1.0).astype(np.float32)
-    blurred = _averaged(level) if smooth else level
+    blurred = _averaged(level)
     # the sign decides which voxels there are; the average only where the border passes
     level = np.where(padded, np.maximum(blurred, 0.05), np.minimum(blurred, -0.05))
     corners = _corners(padded)

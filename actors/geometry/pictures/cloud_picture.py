@@ -56,8 +56,7 @@ def draw_points(
     local, colours = local[ahead], colours[ahead]
     size_m = np.broadcast_to(size_m, ahead.shape)[ahead]
     depth = local[:, 2].astype(np.float32)
-    column = np.rint(local[:, 0] / depth * camera.fx_px + camera.cx_px).astype(np.int64)
-    row = np.rint(local[:, 1] / depth * camera.fy_px + camera.cy_px).astype(np.int64)
+    column, row = np.rint(camera.column_row(local[:, 0], local[:, 1], depth)).astype(np.int64)
     edge = np.clip(np.rint(size_m * camera.fx_px / depth), 1, SPLAT_PX_MAX).astype(np.int64)
     nearest = np.full(camera.shape, np.inf, np.float32)
     owner = np.full(camera.shape, -1, np.int64)

@@ -43,6 +43,9 @@ SMOOTH_REACH: Final = 4
 CREASE_COS: Final = float(np.cos(np.radians(38.0)))
 """Faces that meet at less than 38 degrees are shaded as one curved surface."""
 
+FIELD_DEG: Final = 30.0
+"""Opening across the width; small ones look like a technical drawing."""
+
 FLOOR_REACH: Final = 1.6
 """How far shadows reach, in diagonals of the scene, before they have faded out."""
 
@@ -87,7 +90,6 @@ def viewpoint(
     azimuth_deg: float = -50.0,
     elevation_deg: float = 30.0,
     size_px: tuple[int, int] = (960, 720),
-    field_deg: float = 30.0,
 ) -> Acquisition:
     """Return a camera that sees all points, filling the picture.
 
@@ -96,10 +98,9 @@ def viewpoint(
         azimuth_deg: Where the camera stands around z; 0 on the side of x, 90 on the side of y.
         elevation_deg: How far above the horizon, below 90.
         size_px: Width and height.
-        field_deg: Opening across the width; small ones look like a technical drawing.
     """
     width, height = size_px
-    focal = 0.5 * width / np.tan(np.radians(field_deg) / 2.0)
+    focal = 0.5 * width / np.tan(np.radians(FIELD_DEG) / 2.0)
     camera = Camera(width, height, focal, focal, (width - 1) / 2.0, (height - 1) / 2.0)
     low, high = points_m.min(0), points_m.max(0)
     centre = (low + high) / 2.0
@@ -125,7 +126,6 @@ def draw_bodies(
     *,
     ground_z_m: float | None = None,
     relight: float = 1.0,
-    seed: int = 0,
 ) -> Picture:
     """Draw meshes in soft light on a light background.
 
@@ -135,7 +135,6 @@ def draw_bodies(
         ground_z_m: Height of a floor that catches shadows and fades into the background.
         relight: 1 lights plain colours; 0 shows colours as they are (photographs bring light
             of their own); values between mix.
-        seed: Seed of the ray directions.
 
     Returns:
         RGB, uint8, (H, W, 3).
@@ -149,7 +148,7 @@ def draw_bodies(
     if ground_z_m is not None:
         floor = _add_floor(scene, hits, (eye, rays), ground_z_m)
     body = hits.seen & ~floor
-    light = _lighting(scene, hits, view.world_from_camera, np.random.default_rng(seed))
+    light = _lighting(scene, hits, view.world_from_camera, np.random.default_rng(0))
     light = _smoothed(light, hits, fine.shape)
     picture = background(fine.shape).reshape(-1, 3)
     if floor.any():

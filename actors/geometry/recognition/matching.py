@@ -86,13 +86,11 @@ class ModelMatch:
         planes: The large planes taken out of the scene first, largest first: unit normal towards
             the best cluster and offset, normal . x + offset = 0, (P, 4).
         tolerance_m: Distance up to which two points are the same place.
-        cluster_points_m: Points of the best cluster, thinned, scene frame, (N, 3).
     """
 
     ranking: tuple[ClusterMatch, ...]
     planes: Pose
     tolerance_m: float
-    cluster_points_m: Points
 
     @property
     def best(self) -> ClusterMatch:
@@ -106,9 +104,11 @@ def find_model(
     *,
     eye_m: Points | None = None,
     seed: int = 0,
-    voxel_m: float | None = None,
 ) -> ModelMatch:
     """Find a model in a cluttered scene.
+
+    Both are thinned to a grid of 1/64 of the model's diagonal, or of 1.5 times the spacing of the
+    coarser cloud if that is more.
 
     Args:
         model_m: Points of the object, metres, model frame, (N, 3), finite.
@@ -116,8 +116,6 @@ def find_model(
         eye_m: Where the camera stood, scene frame, (3,), if one took the whole scene: then a
             complete model is not blamed for its far side.
         seed: Seed of the sampling; equal seeds give equal poses.
-        voxel_m: Thinning grid in metres; by default 1/64 of the model's diagonal,
-            or 1.5 times the spacing of the coarser cloud if that is more.
 
     Returns:
         The pose of the model in every cluster that could hold it, best first. A bad best is
@@ -129,7 +127,7 @@ def find_model(
     Source: features after Rusu, Blodow, Beetz 2009 (FPFH); use in ENACT 4.2 (perception).
     """
     spacing_m = max(spacing(model_m), spacing(scene_m))
-    voxel_m = voxel_m or max(diagonal_m(model_m) / 64.0, 1.5 * spacing_m, 1e-4)
+    voxel_m = max(diagonal_m(model_m) / 64.0, 1.5 * spacing_m, 1e-4)
     model = thinned(model_m, voxel_m)
     if len(model) < 50:
         raise NoMatchError(
@@ -153,7 +151,7 @@ def find_model(
     )
     winner = clusters[ranking[0].cluster]
     side = np.sign(planes[:, :3] @ winner.mean(0) + planes[:, 3])
-    return ModelMatch(tuple(ranking), planes * side[:, None], 2.0 * voxel_m, winner)
+    return ModelMatch(tuple(ranking), planes * side[:, None], 2.0 * voxel_m)
 
 
 def rigid_fit(source_m: Points, target_m: Points) -> Pose:

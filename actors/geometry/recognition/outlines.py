@@ -55,12 +55,7 @@ AROUND_PX: Final = 24
 
 
 class OutlineField:
-    """Distances to the outline of a surface as seen from above, on a grid.
-
-    Args:
-        surface: Product frame.
-        scene: Of the surface, from `ray_scene`.
-    """
+    """Distances to the outline of a surface as seen from above, on a grid."""
 
     def __init__(self, surface: Surface, scene: Any) -> None:
         from scipy.ndimage import binary_closing, distance_transform_edt

@@ -167,15 +167,12 @@ MATCH_M: Final = 0.03
 """Farthest that a package moves between two stops and is still taken for the same one."""
 
 
-def assigned(
-    found_m: Sequence[Points], known_m: Sequence[Points], *, reach_m: float = MATCH_M
-) -> list[int | None]:
+def assigned(found_m: Sequence[Points], known_m: Sequence[Points]) -> list[int | None]:
     """Match places that are seen to places that are known, each at most once.
 
     Args:
         found_m: Positions (2,) seen, metres, tray frame.
         known_m: Positions (2,) known.
-        reach_m: Farther apart is no match.
 
     Returns:
         For each seen position the number of the known one, or None; the sum of distances of
@@ -187,8 +184,8 @@ def assigned(
     if found_m and known_m:
         apart = np.linalg.norm(np.array(found_m)[:, None] - np.array(known_m)[None], axis=2)
         # Beyond reach all costs are equal, so that a hopeless pair never spoils a good one.
-        for row, column in zip(*linear_sum_assignment(np.minimum(apart, reach_m)), strict=True):
-            if apart[row, column] < reach_m:
+        for row, column in zip(*linear_sum_assignment(np.minimum(apart, MATCH_M)), strict=True):
+            if apart[row, column] < MATCH_M:
                 matches[row] = int(column)
     return matches
 

@@ -130,8 +130,7 @@ def _disagreement(
     x, y, z = moved(point_m, inverse(poses[1]) @ poses[0]).T
     front = z > 1e-6
     x, y, z = x[front], y[front], z[front]
-    column = np.rint(x / z * camera.fx_px + camera.cx_px)
-    row = np.rint(y / z * camera.fy_px + camera.cy_px)
+    column, row = np.rint(camera.column_row(x, y, z))
     inside = (column >= 0) & (row >= 0) & (column < camera.width_px) & (row < camera.height_px)
     seen = there[row[inside].astype(int), column[inside].astype(int)]
     difference = np.abs(z[inside] - seen)[seen > 0] / seen[seen > 0]

@@ -120,9 +120,6 @@ def read_recording(directory: Path, *, views_max: int | None = None) -> Recordin
 def paired_images(directory: Path) -> list[tuple[Path, Path]]:
     """Return the (colour, depth) files that belong together, in order.
 
-    Args:
-        directory: The recording.
-
     Raises:
         InputFileError: No images, one kind without the other, or a pair in `rgbd.match` without its
             files.

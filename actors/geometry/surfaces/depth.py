@@ -134,8 +134,7 @@ def depth_of_points(points_m: npt.NDArray[np.floating], camera: Camera) -> Image
         (H, W) float32, metres; NaN where no point falls, the nearest where several do.
     """
     ahead = points_m[points_m[:, 2] > 0.0]
-    column = np.rint(ahead[:, 0] / ahead[:, 2] * camera.fx_px + camera.cx_px).astype(np.int64)
-    row = np.rint(ahead[:, 1] / ahead[:, 2] * camera.fy_px + camera.cy_px).astype(np.int64)
+    column, row = np.rint(camera.column_row(*ahead.T)).astype(np.int64)
     inside = (column >= 0) & (column < camera.width_px) & (row >= 0) & (row < camera.height_px)
     depth_m = np.full(camera.shape, np.inf, np.float32)
     np.minimum.at(depth_m, (row[inside], column[inside]), ahead[inside, 2].astype(np.float32))

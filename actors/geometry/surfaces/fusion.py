@@ -33,6 +33,9 @@ VOXEL_M: Final = 0.001
 """Edge of the fusion grid, which rounds edges: at 2 mm the ridge of a carton was 0.5 mm short, and
 each look put the carton 0.5 mm beside its place."""
 
+ROUNDS: Final = 4
+"""How often each view moves."""
+
 TRIANGLES_MAX: Final = 20_000
 """Flat parts of a finer surface are thinned to that: rendering and registering then take as long
 as at 2 mm, edges stay, and trained models move by less than 0.02 mm along the plate."""
@@ -134,7 +137,7 @@ def fuse_views(
 
 
 def refined_poses(
-    views: Sequence[Surface], poses: Sequence[Pose], *, rounds: int = 4, by_plate: bool = False
+    views: Sequence[Surface], poses: Sequence[Pose], *, by_plate: bool = False
 ) -> list[Pose]:
     """Fit the views to each other, starting from and held by their acquisition poses.
 
@@ -143,7 +146,6 @@ def refined_poses(
     Args:
         views: Surfaces in their camera frames.
         poses: world_from_camera of each, (4, 4), metres.
-        rounds: How often each view moves.
         by_plate: Whether the poses are those of `plate.seen_from`: far more certain.
 
     Returns:
@@ -161,7 +163,7 @@ def refined_poses(
         chosen = random.permutation(len(every))[:PAIRS_PER_VIEW]
         points.append(view.vertices_m[chosen].astype(float))
         normals.append(every[chosen])
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         world = [moved(p, pose) for p, pose in zip(points, refined, strict=True)]
         turned = [n @ pose[:3, :3].T for n, pose in zip(normals, refined, strict=True)]
         trees = [cKDTree(each) for each in world]

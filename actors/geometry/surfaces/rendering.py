@@ -58,19 +58,15 @@ def ray_scene(vertices_m: npt.NDArray[np.floating], triangles: npt.NDArray[np.in
 def render_depth(
     placed: Sequence[tuple[Surface, npt.NDArray[np.float64]]],
     acquisition: Acquisition,
-    *,
-    window: tuple[slice, slice] | None = None,
 ) -> npt.NDArray[np.float32]:
     """Return the depth image of surfaces in the world.
 
     Args:
         placed: Surfaces and, for each, world_from_surface (4, 4).
         acquisition: Camera and pose.
-        window: Rows and columns to render; the whole image when absent.
 
     Returns:
-        (H, W) float32, metres along the optical axis, NaN where nothing is hit; of the window's
-        size when there is one.
+        (H, W) float32, metres along the optical axis, NaN where nothing is hit.
     """
     depth_m = np.full(acquisition.camera.shape, np.nan, np.float32)
     if placed:
@@ -81,16 +77,14 @@ def render_depth(
             triangles.append(surface.triangles + first)
             first += len(surface.vertices_m)
         mesh = np.concatenate(vertices), np.concatenate(triangles)
-        covered, depth_m[covered] = depth_where_seen(*mesh, acquisition.camera, window=window)
-    return depth_m[window or slice(None)]
+        covered, depth_m[covered] = depth_where_seen(*mesh, acquisition.camera)
+    return depth_m
 
 
 def depth_where_seen(
     vertices_m: npt.NDArray[np.floating],
     triangles: npt.NDArray[np.integer],
     camera: Camera,
-    *,
-    window: tuple[slice, slice] | None = None,
 ) -> tuple[tuple[slice, slice], npt.NDArray[np.float32]]:
     """Return the rows and columns in which a camera sees a mesh, and its depth there.
 
@@ -98,14 +92,11 @@ def depth_where_seen(
         vertices_m: (N, 3), camera frame, metres.
         triangles: (M, 3), vertex numbers.
         camera: What looks.
-        window: Rows and columns to look at; the whole image when absent.
 
     Returns:
         The pixels around all vertices, and depth of their size, metres, NaN where nothing is hit.
     """
-    rows, columns = window or (slice(None), slice(None))
-    covered = rows.indices(camera.shape[0]), columns.indices(camera.shape[1])
-    low, high = (np.array([part[end] for part in covered]) for end in (0, 1))
+    low, high = np.zeros(2, int), np.array(camera.shape)
     away_m = vertices_m[:, 2]
     if away_m.min() > 0.0:  # else some of it is behind the camera, and may be anywhere
         row = camera.fy_px * vertices_m[:, 1] / away_m + camera.cy_px

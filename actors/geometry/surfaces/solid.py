@@ -167,8 +167,7 @@ def _seen_from(
     """Return what one view says about points in its camera frame: distance, in reaches; weight."""
     camera = view.acquisition.camera
     x, y, depth = local_m
-    column = np.rint(x / depth * camera.fx_px + camera.cx_px).astype(np.int64)
-    row = np.rint(y / depth * camera.fy_px + camera.cy_px).astype(np.int64)
+    column, row = np.rint(camera.column_row(x, y, depth)).astype(np.int64)
     inside = (column >= 0) & (column < camera.width_px) & (row >= 0) & (row < camera.height_px)
     inside &= depth > 0.0
     pixel = np.where(inside, row * camera.width_px + column, 0)

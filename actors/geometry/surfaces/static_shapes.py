@@ -205,8 +205,7 @@ def _hidden(
         seen = moved(centres[left], inverse(frame.acquisition.world_from_camera))
         ahead = seen[:, 2] > 0.1
         depth = np.where(ahead, seen[:, 2], 1.0)
-        u = np.rint(seen[:, 0] / depth * camera.fx_px + camera.cx_px)
-        v = np.rint(seen[:, 1] / depth * camera.fy_px + camera.cy_px)
+        u, v = np.rint(camera.column_row(seen[:, 0], seen[:, 1], depth))
         good = ahead & (u >= 0) & (v >= 0) & (u < camera.width_px) & (v < camera.height_px)
         row, column = (np.where(good, axis, 0).astype(np.int64) for axis in (v, u))
         measured = np.where(good, metres(frame.depth_mm)[row, column], np.nan)

@@ -140,12 +140,7 @@ def _worse(one_way: tuple[float, float, Points], other_way: tuple[float, float, 
 
 
 def samples_on(mesh: Mesh, count: int = SAMPLES) -> Points:
-    """Return points spread over a surface by area, (`count`, 3), the same at each call.
-
-    Args:
-        mesh: With at least one triangle.
-        count: How many.
-    """
+    """Return points spread over a surface by area, (`count`, 3), the same at each call."""
     corners = np.asarray(mesh.vertices_m, float)[mesh.triangles]
     one, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     area = np.linalg.norm(np.cross(one, other), axis=1)

@@ -126,7 +126,7 @@ def felt(frame_from_product: F64, grasp: Grasp, felt_m: float) -> F64:
     return pose
 
 
-def felt_on(felt_m: float, result: str, grasp: Grasp, gripper: Gripper | None = None) -> float:
+def felt_on(felt_m: float, result: str, grasp: Grasp) -> float:
     """Return how far beside where it was seen a package is, by all fingers that came down on it.
 
     A finger comes down on a package that is farther off than the hand has room: anything beyond
@@ -137,9 +137,8 @@ def felt_on(felt_m: float, result: str, grasp: Grasp, gripper: Gripper | None = 
         felt_m: By those before, metres along the grasp's axis.
         result: How the last grasp ended.
         grasp: Of its product.
-        gripper: What came down; the cell's when absent.
     """
-    step_m = FELT_SHARE * (open_m(grasp, gripper or Gripper(), on_belt=True) - grasp.width_m)
+    step_m = FELT_SHARE * (open_m(grasp, Gripper(), on_belt=True) - grasp.width_m)
     side = FELT_SIDE.get(result, 0.0)
     return felt_m + side * step_m * (0.5 if side * felt_m < 0.0 else 1.0)
 

@@ -37,21 +37,20 @@ THICKNESS_M: Final = 0.002
 """What is at most so far inside of the outermost points is touched by a finger."""
 
 
-def grasp_of(surface: Surface, *, mass_kg: float, gripper: Gripper | None = None) -> Grasp:
+def grasp_of(surface: Surface, *, mass_kg: float) -> Grasp:
     """Return how a product is grasped.
 
     Args:
         surface: Trained, closed, product frame.
         mass_kg: Of the product.
-        gripper: What holds it; the cell's when absent.
     """
-    gripper = gripper or Gripper()
+    half_across_m = Gripper().half_across_m
     centre = centre_of(surface)
     points, normals, area_m2 = _sampled(surface)
     found: list[tuple[float, float, F64]] = []
     for angle in np.pi * np.arange(TURNS) / TURNS:
         axis = np.array([-np.sin(angle), np.cos(angle), 0.0])
-        low, high = _sides(points, centre, axis, gripper.half_across_m)
+        low, high = _sides(points, centre, axis, half_across_m)
         found.append((high - low, (high + low) / 2.0, axis))
     narrowest = min(width for width, _, _ in found)
     width_m, middle, axis = max(
@@ -61,7 +60,7 @@ def grasp_of(surface: Surface, *, mass_kg: float, gripper: Gripper | None = None
     across = np.cross(axis, [0.0, 0.0, 1.0])
     point = middle * axis + float(across @ centre) * across
     point[2] = max(LEAST_HEIGHT_M, centre[2])
-    near = np.abs((points - centre) @ across) <= gripper.half_across_m
+    near = np.abs((points - centre) @ across) <= half_across_m
     beyond = (points @ axis - middle) * np.sign(normals @ axis)
     flat = np.abs(normals @ axis) > np.cos(FLAT_RAD)
     touched = near & flat & (beyond > width_m / 2.0 - THICKNESS_M)

@@ -105,14 +105,11 @@ def planned_rows(
     return slots
 
 
-def contacts_between(
-    surfaces: Mapping[str, Surface], *, rim_m: float = RIM_M
-) -> dict[tuple[str, str], float]:
+def contacts_between(surfaces: Mapping[str, Surface]) -> dict[tuple[str, str], float]:
     """Return how far apart along x the origins of two products are when the hulls touch.
 
     Args:
         surfaces: Trained surface of each product, product frame.
-        rim_m: Height of the tray's rim.
 
     Returns:
         By the product that stands and the one that is pushed against it, metres; the one that
@@ -122,7 +119,7 @@ def contacts_between(
     extents = {name: _extent(surface, sides, heights) for name, surface in surfaces.items()}
     found = {}
     for pushed, (low, _) in extents.items():
-        found["", pushed] = -float(low[heights <= rim_m].min())
+        found["", pushed] = -float(low[heights <= RIM_M].min())
         for standing, (_, high) in extents.items():
             found[standing, pushed] = float(np.nanmax(np.where(high < low, np.nan, high - low)))
     return found

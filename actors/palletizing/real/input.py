@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import json
 import sys
-import time
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -24,6 +23,7 @@ from actors.geometry.recognition.matching import NoMatchError, find_model
 from actors.geometry.scans.pointcloud_files import read_cloud
 from actors.geometry.surfaces.rgbd_fusion import FusionError, natural_voxel_m, residual
 from actors.geometry.surfaces.surface_files import ply_bytes
+from actors.laps import Laps
 from actors.palletizing.real.pictures import match_sheet, recording_sheet
 from actors.palletizing.real.recorded import RecordedPerception
 from actors.palletizing.real.training import trained_surface
@@ -89,7 +89,7 @@ def run_match(
 
 def _train(directory: Path, out: Path, voxel_m: float | None, say: Say) -> None:
     """Read, train, draw, write."""
-    clock = _Clock()
+    clock = Laps()
     check_output(out)
     perception = RecordedPerception(str(directory))
     recording = perception.recording
@@ -130,7 +130,7 @@ def _train(directory: Path, out: Path, voxel_m: float | None, say: Say) -> None:
 
 def _find(files: tuple[Path, Path], out: Path, seed: int, say: Say) -> int:
     """Read, search, judge, draw, write."""
-    clock = _Clock()
+    clock = Laps()
     check_output(out)
     model = read_cloud(files[0], asked="a model: point cloud or mesh (PCD or PLY)")
     scene = read_cloud(files[1], asked="a scene: point cloud (PCD or PLY)")
@@ -280,20 +280,3 @@ class _Progress:
             print(
                 f"\rtraining   {done} of {self._views} views", end=end, file=sys.stderr, flush=True
             )
-
-
-class _Clock:
-    """Laps of a run, for its last line."""
-
-    def __init__(self) -> None:
-        self._since_s = time.monotonic()
-        self._laps: list[str] = []
-
-    def lap(self, name: str) -> None:
-        """End a lap under this name."""
-        now_s = time.monotonic()
-        self._laps.append(f"{name} {now_s - self._since_s:.1f} s")
-        self._since_s = now_s
-
-    def __str__(self) -> str:
-        return ", ".join(self._laps)

@@ -9,7 +9,7 @@ import numpy as np
 from actors.geometry.pictures.cloud_picture import draw_points, with_box
 from actors.geometry.pictures.mesh_picture import Body, draw_bodies, viewpoint
 from actors.geometry.pictures.picture import ALARM, GOOD, bars, depth_picture, tiles
-from actors.geometry.poses import inverse, looking_at, moved
+from actors.geometry.poses import along_z, inverse, looking_at, moved
 from actors.geometry.shapes import Acquisition, Camera
 
 if TYPE_CHECKING:
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     Pose = npt.NDArray[np.float64]
 
 TILE_PX: Final = (800, 600)
+ABOVE_DEG: Final = 10.0
+"""So far is a view from beside above the recorded one."""
 CLAY: Final = np.array((196, 202, 210), np.uint8)
 
 
@@ -53,15 +55,12 @@ def recording_sheet(
     )
 
 
-def orbited(
-    frame: RecordedFrame, *, azimuth_deg: float, elevation_deg: float = 10.0
-) -> Acquisition:
+def orbited(frame: RecordedFrame, *, azimuth_deg: float) -> Acquisition:
     """Return the view from beside a recorded one, turned about what lies in its middle.
 
     Args:
         frame: The view to start from.
         azimuth_deg: To the right of it as it looks, negative to the left.
-        elevation_deg: Above it.
     """
     from scipy.spatial.transform import Rotation
 
@@ -71,9 +70,7 @@ def orbited(
     width, height = TILE_PX
     turn, pivot, back = np.eye(4), np.eye(4), np.eye(4)
     pivot[2, 3], back[2, 3] = frame.median_m, -frame.median_m
-    turn[:3, :3] = Rotation.from_euler(
-        "yx", (-azimuth_deg, -elevation_deg), degrees=True
-    ).as_matrix()
+    turn[:3, :3] = Rotation.from_euler("yx", (-azimuth_deg, -ABOVE_DEG), degrees=True).as_matrix()
     return Acquisition(
         Camera(width, height, focal, focal, (width - 1) / 2.0, (height - 1) / 2.0),
         recorded.world_from_camera @ pivot @ turn @ back,
@@ -132,12 +129,8 @@ def level_from_scene(match: ModelMatch) -> Pose:
     """Return the transform that stands the scene upright: z normal to its largest plane."""
     if not len(match.planes):
         return np.eye(4)
-    up = match.planes[0, :3]
-    helper = np.eye(3)[np.argmin(np.abs(up))]
-    x = np.cross(helper, up)
-    x /= np.linalg.norm(x)
     scene_from_level = np.eye(4)
-    scene_from_level[:3, :3] = np.stack([x, np.cross(up, x), up], axis=1)
+    scene_from_level[:3, :3] = along_z(match.planes[0, :3])
     return inverse(scene_from_level)
 
 

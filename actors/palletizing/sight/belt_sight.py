@@ -213,13 +213,7 @@ def _recognised(
 
 
 def _tilted(piece: Piece, upright: BeltSight, models: Mapping[str, Surface]) -> BeltSight:
-    """Return how something lies or leans that stands upright nowhere; `upright` if no product does.
-
-    Args:
-        piece: What was seen.
-        upright: What it resembles most.
-        models: Trained surface of each product.
-    """
+    """Return how something lies or leans that stands nowhere; `upright` if no product does."""
     fits = {
         product: leaning(piece.cloud, surface, upright.belt_from_product)
         for product, surface in models.items()

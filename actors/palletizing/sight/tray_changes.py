@@ -46,18 +46,15 @@ ABSENT_SHARE: Final = 0.5
 """… and surely does not with less."""
 
 
-def where_seen(
-    frame: DepthFrame, surface: Surface, poses: Sequence[F64], *, least: float = ABSENT_SHARE
-) -> F64 | None:
+def where_seen(frame: DepthFrame, surface: Surface, poses: Sequence[F64]) -> F64 | None:
     """Return where a package is seen; None if at none of some places.
 
     Args:
         frame: The picture; its world is the tray frame.
         surface: Its trained surface.
         poses: tray_from_product of each place, the likely ones first.
-        least: Share of the package that must be seen; what something hides is not counted.
     """
-    seen_m, best = metres(frame.depth_mm), None
+    seen_m, best, least = metres(frame.depth_mm), None, ABSENT_SHARE
     for pose in poses:
         rendered_m = render_depth([(surface, pose)], frame.acquisition)
         with np.errstate(invalid="ignore"):

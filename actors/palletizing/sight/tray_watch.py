@@ -56,13 +56,10 @@ class TrayWatch:
     Args:
         empty: The empty tray.
         models: Trained surface of each product.
-        limits: Of the inspection; `LIMITS` when absent.
     """
 
-    def __init__(
-        self, empty: DepthFrame, models: Mapping[str, Surface], *, limits: Limits | None = None
-    ) -> None:
-        self._empty, self._models, self._limits = empty, models, limits or LIMITS
+    def __init__(self, empty: DepthFrame, models: Mapping[str, Surface]) -> None:
+        self._empty, self._models = empty, models
         self._last: DepthFrame | None = None
         self.seen: dict[int, Seen] = {}
         self.frame = empty
@@ -98,7 +95,7 @@ class TrayWatch:
         before_mm = without(self.frame, self._empty.depth_mm, others)
         found = inspect_place(
             self.frame, before_mm, self._models[product], planned,
-            limits=self._limits, others=[pose for _, pose in others],
+            limits=LIMITS, others=[pose for _, pose in others],
         )  # fmt: skip
         return Seen(
             verdict=found.verdict,

@@ -282,10 +282,6 @@ class Damage:
 def dented_mesh(product: str, dents: Sequence[Dent]) -> Mesh:
     """Return the shape of a damaged package.
 
-    Args:
-        product: Name of the product.
-        dents: What it has suffered.
-
     Returns:
         Vertices (N, 3), metres, product frame, and triangles (M, 3); shared if there is no dent.
     """

@@ -11,12 +11,12 @@ that perception knows no difference.
 from __future__ import annotations
 
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, ClassVar, Final
 
 import numpy as np
 
 from actors.geometry.arms.kinematics import link_poses
-from actors.geometry.poses import inverse, moved
+from actors.geometry.poses import along_z, inverse, moved
 from actors.geometry.shapes import VGA, Acquisition, DepthFrame
 from actors.palletizing.control.controller import ControllerError
 from actors.palletizing.simulation.cell.scene import (
@@ -60,35 +60,31 @@ BELT_LOOKS_AT_M: Final = -0.10
 """Where it looks, along the belt from the light barrier: at the middle of what has arrived."""
 
 
-class BeltSensor(Protocol):
-    """A depth sensor fixed above the end of the belt; the world of its poses is the belt frame.
+class _FixedSensor:
+    """A depth sensor at a fixed place over the physical cell.
 
-    A real one implements the same two methods, as for the tray.
+    Args:
+        shown: Returns what moves in the cell, as it is now.
+        seed: Seed of the noise.
+        layout: Where things stand.
+
+    Attributes:
+        over: The area of the layout whose frame is the world of its poses.
+        eye_m: Where in that frame it looks down from.
+        noise: Added to the seed: sensors of one seed differ in their noise.
     """
 
-    def capture_empty(self) -> DepthFrame:
-        """Return an image of the belt with nothing on it."""
-        ...
-
-    def capture(self, stop: int) -> DepthFrame:
-        """Return an image of the belt, a package in the light barrier.
-
-        Args:
-            stop: Number of the package, from 0; a real sensor ignores it.
-        """
-        ...
-
-
-class _FixedSensor:
-    """A depth sensor at a fixed place over the physical cell."""
+    over: ClassVar[str]
+    eye_m: ClassVar[tuple[float, float, float]]
+    noise: ClassVar[int] = 0
 
     def __init__(
-        self, shown: Callable[[], ShownCell], layout: CellLayout, world: F64, true: F64, seed: int
+        self, shown: Callable[[], ShownCell], *, seed: int, layout: CellLayout | None = None
     ) -> None:
-        self._shown, self._layout = shown, layout
-        self._world_from_base = inverse(world)
-        self._true = Acquisition(VGA, true)
-        self._seed = seed
+        self._shown, self._layout = shown, layout or CellLayout()
+        self._world_from_base = inverse(self._layout.frames()[self.over])
+        self._true = Acquisition(VGA, looking_down(np.array(self.eye_m)))
+        self._seed = seed + self.noise
         self._moment = Repeats()
         self._frozen: tuple[int, DepthFrame] | None = None
         self._still_m: npt.NDArray[np.float32] | None = None
@@ -158,40 +154,22 @@ class _FixedSensor:
 
 
 class PhysicalTraySensor(_FixedSensor):
-    """Depth sensor 0.95 m above the tray of the physical cell; a `TraySensor`.
+    """Depth sensor 0.95 m above the tray of the physical cell; a `TraySensor`."""
 
-    Args:
-        shown: Returns what moves in the cell, as it is now.
-        layout: Where things stand.
-        seed: Seed of the noise.
-    """
-
-    def __init__(
-        self, shown: Callable[[], ShownCell], *, seed: int, layout: CellLayout | None = None
-    ) -> None:
-        layout = layout or CellLayout()
-        true = looking_down(np.array([0.0, 0.0, OVERHEAD_M]))
-        super().__init__(shown, layout, layout.base_from_tray, true, seed)
+    over = "tray"
+    eye_m = (0.0, 0.0, OVERHEAD_M)
 
 
 class PhysicalBeltSensor(_FixedSensor):
-    """Depth sensor 0.80 m above the end of the belt; a `BeltSensor`.
+    """Depth sensor 0.80 m above the end of the belt; a `TraySensor` in the frame of the belt.
 
     Its calibration to the robot is off by a little, and differently for each package that lies in
     the light barrier: so the robot grasps beside where it means to, as it does in a plant.
-
-    Args:
-        shown: Returns what moves in the cell, as it is now.
-        layout: Where things stand.
-        seed: Seed of the noise.
     """
 
-    def __init__(
-        self, shown: Callable[[], ShownCell], *, seed: int, layout: CellLayout | None = None
-    ) -> None:
-        layout = layout or CellLayout()
-        true = looking_down(np.array([BELT_LOOKS_AT_M, 0.0, BELT_OVERHEAD_M]))
-        super().__init__(shown, layout, layout.base_from_belt, true, seed + 1_000_003)
+    over = "belt"
+    eye_m = (BELT_LOOKS_AT_M, 0.0, BELT_OVERHEAD_M)
+    noise = 1_000_003
 
     def _reported(self, shown: ShownCell) -> Acquisition:
         package = self._arrived(shown)
@@ -257,7 +235,7 @@ def arm_meshes(shown: ShownCell) -> list[Mesh]:
             length -= HAND_HALF_M[2]
         pose = np.array(frames[int(second)])
         # The link ends in the frame's origin, along the axis of the frame before.
-        pose[:3, :3] = _frame_along((end - start) / np.linalg.norm(end - start))
+        pose[:3, :3] = along_z((end - start) / np.linalg.norm(end - start))
         pose[:3, 3] = start
         meshes += _in(pose, [_capsule(round(length, 9), float(radius))])
     hand = box_mesh((2 * HAND_HALF_M[0], 2 * HAND_HALF_M[1], 2 * HAND_HALF_M[2]))
@@ -267,13 +245,6 @@ def arm_meshes(shown: ShownCell) -> list[Mesh]:
         beside = side * (shown.width_m / 2.0 + PAD_HALF_M[1])
         pads.append(shifted(pad, [0.0, beside, PAD_CENTRE_M - PAD_HALF_M[2]]))
     return [*meshes, *_in(frames[-1], [hand, *pads])]
-
-
-def _frame_along(z: F64) -> F64:
-    """Return a right-handed turn, (3, 3), whose z axis is a unit vector."""
-    x = np.cross(z, [1.0, 0.0, 0.0] if abs(z[0]) < 0.7 else [0.0, 1.0, 0.0])
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z], axis=1)
 
 
 @lru_cache(maxsize=16)

@@ -7,7 +7,7 @@
 `…remote_cell:hands?port=7460`      what a person does, for the operator
 `…remote_cell:cell_frames`          where tray, belt and bin stand
 `…remote_cell:tray_sensor?port=…`   a `TraySensor`, for `open_sensor`
-`…remote_cell:belt_sensor?port=…`   a `BeltSensor`, for `open_sensor`
+`…remote_cell:belt_sensor?port=…`   the same above the belt
 ==================================  ================================================================
 
 Rule a change must keep: one request at a time over a connection; a connection that was lost is made
@@ -25,9 +25,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from actors.palletizing.control.controller import ArmMeasured, ControllerError, GripperMeasured
-from actors.palletizing.simulation.cell.arm import CYCLE_S
+from actors.palletizing.simulation.cell.arm import ArmOfCell
 from actors.palletizing.simulation.cell.messages import receive, send
-from actors.palletizing.simulation.cell.scene import ARM, HOME_RAD, CellLayout
+from actors.palletizing.simulation.cell.scene import CellLayout
 from actors.palletizing.simulation.physical_sensors import PhysicalBeltSensor, PhysicalTraySensor
 
 if TYPE_CHECKING:
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
-    from actors.geometry.arms.joint_paths import Arm
     from actors.palletizing.simulation.cell.truth import CellTruth, ShownCell
 
     F64 = npt.NDArray[np.float64]
@@ -126,26 +125,19 @@ class RemoteCell:
             self._connection = None
 
 
-class RemoteArm:
-    """The arm of a cell in another process; an `ArmController`."""
+class _Remote:
+    """Something of a cell in another process."""
 
     def __init__(self, cell: RemoteCell) -> None:
         self._cell = cell
 
-    @property
-    def cycle_s(self) -> float:
-        """Period of control."""
-        return CYCLE_S
+    def close(self) -> None:
+        """Disconnect; an arm brakes, what a gripper holds stays held."""
+        self._cell.close()
 
-    @property
-    def model(self) -> Arm:
-        """Kinematics and limits."""
-        return ARM
 
-    @property
-    def posture_rad(self) -> F64:
-        """Where the joints go as far as the tool leaves it open."""
-        return np.array(HOME_RAD)
+class RemoteArm(_Remote, ArmOfCell):
+    """The arm of a cell in another process; an `ArmController`."""
 
     def start(self) -> None:
         """Take commands of this connection from now on, and of no other."""
@@ -164,16 +156,9 @@ class RemoteArm:
         """Stop the arm."""
         self._cell.ask("brake")
 
-    def close(self) -> None:
-        """Disconnect; the arm brakes."""
-        self._cell.close()
 
-
-class RemoteGripper:
+class RemoteGripper(_Remote):
     """The gripper of a cell in another process; a `GripperController`."""
-
-    def __init__(self, cell: RemoteCell) -> None:
-        self._cell = cell
 
     def start(self) -> None:
         """Take commands of this connection from now on, and of no other."""
@@ -192,12 +177,8 @@ class RemoteGripper:
         """Close the fingers until they press with a force."""
         self._cell.ask("grip_force", float(force_n))
 
-    def close(self) -> None:
-        """Disconnect; what it holds stays held."""
-        self._cell.close()
 
-
-class RemoteBelt:
+class RemoteBelt(_Remote):
     """Belt and tray of a cell in another process; a `BeltController`.
 
     Args:
@@ -207,7 +188,8 @@ class RemoteBelt:
     """
 
     def __init__(self, cell: RemoteCell, *, feeds: bool = False) -> None:
-        self._cell, self._feeds, self._fed = cell, feeds, False
+        super().__init__(cell)
+        self._feeds, self._fed = feeds, False
 
     def run_belt(self) -> None:
         """Let a package come, if the belt feeds; move it until one interrupts the barrier."""
@@ -238,16 +220,9 @@ class RemoteBelt:
         """Take the tray away with all that is on it; return the numbers of those packages."""
         return list(self._cell.ask("change_tray"))
 
-    def close(self) -> None:
-        """Disconnect."""
-        self._cell.close()
 
-
-class RemoteHands:
+class RemoteHands(_Remote):
     """What a person does by hand in a cell in another process."""
-
-    def __init__(self, cell: RemoteCell) -> None:
-        self._cell = cell
 
     def remove(self, number: int) -> None:
         """Take the package that came as the number-th out of the cell."""
@@ -276,12 +251,7 @@ def hands(port: str, host: str = "") -> RemoteHands:
 
 def cell_frames() -> dict[str, F64]:
     """Return where tray, belt and reject bin of the cell stand, base_from_entity by name."""
-    layout = CellLayout()
-    return {
-        "tray": layout.base_from_tray,
-        "belt": layout.base_from_belt,
-        "bin": layout.base_from_bin,
-    }
+    return CellLayout().frames()
 
 
 def tray_sensor(port: str, seed: str = "1", host: str = "") -> PhysicalTraySensor:

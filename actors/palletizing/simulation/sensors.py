@@ -121,13 +121,7 @@ class SimulatedOrbitSensor:
         self._last: tuple[npt.NDArray[np.float32], Acquisition] | None = None
 
     def capture(self, product: str, view: int, views: int) -> DepthFrame:
-        """Return the image of one viewpoint; its reported pose differs a little from the true one.
-
-        Args:
-            product: One of `PRODUCTS`.
-            view: Number of the viewpoint.
-            views: How many the orbit has.
-        """
+        """Return the image of one viewpoint; its reported pose differs a little from the truth."""
         again = self._view.again(view, views, *product.encode())[2 + len(product) :]
         random = np.random.default_rng([self._seed, view, *product.encode(), *again])
         if not again or self._last is None:  # the robot stands still while it takes more than one

@@ -48,13 +48,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Case:
-    """One simulated package and what was found.
-
-    Attributes:
-        package: With the truth.
-        finding: With the verdict.
-        check_s: Time of the check.
-    """
+    """One simulated package and what was found."""
 
     package: Package
     finding: Finding
@@ -127,15 +121,7 @@ def judge(
 def graded(
     kind: str, amount: float, count: int, *, seed: int, products: Sequence[str]
 ) -> list[Package]:
-    """Return packages that all have one kind and amount of deviation.
-
-    Args:
-        kind: See `Truth`.
-        amount: See `Truth`.
-        count: How many.
-        seed: Seed of all else.
-        products: Products that come in turn.
-    """
+    """Return packages that all have one kind and amount of deviation."""
     return [
         make_package(
             stop,

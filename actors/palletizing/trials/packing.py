@@ -126,11 +126,7 @@ class Packing:
         self._pictures: list[DepthFrame] = []
         belt_from_tray = inverse(self.layout.base_from_belt) @ self.layout.base_from_tray
         self._belt_watch = BeltWatch(self._belt.capture_empty(), models, belt_from_tray)
-        self._frames = {
-            "belt": self.layout.base_from_belt,
-            "bin": self.layout.base_from_bin,
-            "tray": self.layout.base_from_tray,
-        }
+        self._frames = self.layout.frames()
         self._set_places()
         self._last_rad: F64 | None = None
         self._turned, self._felt_m, self._drop_at_s = False, 0.0, inf

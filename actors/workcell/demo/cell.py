@@ -95,11 +95,7 @@ def configured(template: str, options: Options) -> dict[str, Any]:
 
 
 class RunningCell(running_cell.RunningCell):
-    """A workcell of processes that is up between entering and leaving the block.
-
-    Args:
-        options: What was asked for.
-    """
+    """A workcell of processes that is up between entering and leaving the block."""
 
     def __init__(self, options: Options) -> None:
         def of_this_run(template: str, data: Path, ports: Sequence[int]) -> str:
@@ -111,11 +107,7 @@ class RunningCell(running_cell.RunningCell):
 
 
 class EmbeddedCell(DemoCell):
-    """A workcell in this process: one shard, a thread per actor.
-
-    Args:
-        options: What was asked for.
-    """
+    """A workcell in this process: one shard, a thread per actor."""
 
     def __init__(self, options: Options) -> None:
         super().__init__(options.out / "cell.toml", log="this process's output")

@@ -29,7 +29,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from actors.geometry.files import write_whole
-from actors.running_cell import DemoCell, DemoError
+from actors.running_cell import DemoCell, DemoError, until_interrupted
 from actors.workcell.cameras.sources import CameraError
 from actors.workcell.demo.cell import EmbeddedCell, RunningCell
 from actors.workcell.demo.conduct import Conductor, recording
@@ -49,7 +49,6 @@ from actors.workcell.scores.figures import figure4, pictures_of
 from actors.workcell.scores.scenario_checks import checks_of
 from actors.workcell.scores.trace import trace_of
 from actors.workcell.simulation.recording import cache_folder, kept_recording, record
-from enact_dist.link.signals import StopSignals
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -67,9 +66,6 @@ HULLS_SCORED = 120
 
 def run_demo(options: Options) -> int:
     """Run a scenario and report.
-
-    Args:
-        options: What was asked for.
 
     Returns:
         Exit status: 0 done, 1 the cell failed; what the scores say is the report's matter.
@@ -132,7 +128,7 @@ def _run(options: Options, console: Console) -> Outcome:
         if options.keep_running:
             outcome = _reported(running.config, options, notes, what_if, console)
             console.print(f"the cell stays up: enact world tree online --cell {running.config}")
-            _until_interrupted(running)
+            until_interrupted(running)
             return outcome
     return _reported(running.config, options, notes, what_if, console)
 
@@ -254,10 +250,3 @@ def _reported(
     contents[options.out / "figure4.svg"] = figure4(config)
     write_whole(contents)
     return Outcome(scores, notes.cores, report)
-
-
-def _until_interrupted(running: DemoCell) -> None:
-    """Wait for Ctrl-C or SIGTERM, or until the cell goes down by itself."""
-    with StopSignals() as signals:
-        while not signals.event.wait(1.0):
-            running.check()

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import sys
-import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
@@ -29,6 +28,7 @@ from actors.geometry.hull.space_carving import (
 from actors.geometry.hull.voxel_surface import surface_of
 from actors.geometry.pictures.picture import png_bytes
 from actors.geometry.surfaces.surface_files import ply_bytes
+from actors.laps import Laps
 from actors.workcell.folders.cell import fits, hull_by_actors
 from actors.workcell.folders.pictures import read_shots
 
@@ -155,7 +155,7 @@ def run_folder(
 
 
 def _make(folder: Path, out: Path, options: FolderOptions, say: Say) -> FolderReport:
-    clock = _Clock()
+    clock = Laps()
     check_output(out)
     cameras = read_cameras(folder, unit=options.unit)
     every = [
@@ -180,25 +180,12 @@ def _make(folder: Path, out: Path, options: FolderOptions, say: Say) -> FolderRe
     clock.lap("measured")
     contents = _files(out, shots.shots, carver, grid, rows)
     clock.lap("drawn")
-    report.seconds = clock.laps
+    report.seconds = clock.seconds
     contents[out / "report.json"] = json.dumps(report.as_json(), indent=1).encode()
     write_whole(contents)
     for line in _last_lines(report, out):
         say(line)
     return report
-
-
-class _Clock:
-    """How long each step took."""
-
-    def __init__(self) -> None:
-        self.laps: dict[str, float] = {}
-        self._since_s = time.monotonic()
-
-    def lap(self, name: str) -> None:
-        now_s = time.monotonic()
-        self.laps[name] = round(now_s - self._since_s, 2)
-        self._since_s = now_s
 
 
 def _begun(cameras: CameraSet, shots: Shots) -> FolderReport:

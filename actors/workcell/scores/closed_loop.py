@@ -96,18 +96,19 @@ class _Reconstruction(Reconstruction):
         return self.clock.wall_ns()
 
 
-class _SpeedControl(SpeedControl):
+class _Later:
     clock: testing.ManualClock
 
     def now_ns(self) -> int:
         return self.clock.wall_ns() + round(LATENCY_S * 1e9)
 
 
-class _PathPlanning(PathPlanning):
-    clock: testing.ManualClock
+class _SpeedControl(_Later, SpeedControl):
+    pass
 
-    def now_ns(self) -> int:
-        return self.clock.wall_ns() + round(LATENCY_S * 1e9)
+
+class _PathPlanning(_Later, PathPlanning):
+    pass
 
 
 @dataclass

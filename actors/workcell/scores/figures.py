@@ -45,6 +45,7 @@ CHANGED: Final = (226, 92, 40)
 """What was not."""
 GONE: Final = (214, 178, 84)
 """What the refinement removed."""
+CAPSULE_POINTS: Final = 1500
 STEEL: Final = (196, 202, 210)
 SKIN: Final = (92, 130, 196)
 LIGHT: Final = np.array([0.45, -0.35, 0.82])
@@ -53,11 +54,7 @@ CORNERS: Final = np.array([[x, y, z] for x in (-1.5, 1.7) for y in (-1.6, 1.6) f
 
 
 def figure4(config: Path) -> bytes:
-    """Draw the actors of a cell and the data that they declare to read and write, as SVG.
-
-    Args:
-        config: Its `cell.toml`.
-    """
+    """Draw the actors of a cell and the data that they declare to read and write, as SVG."""
     parsed = load_config(config)
     actors, _ = declarations_of(parsed)
     return svg_of(graph_of(actors), f"cell {parsed.name}").encode()
@@ -210,16 +207,15 @@ def box_points(boxes: F64, colour: Sequence[int] = STEEL, step_m: float = 0.012)
     return shaded(np.concatenate(points), np.concatenate(normals), colour, 1.4 * step_m)
 
 
-def capsule_points(capsules: F64, colour: Sequence[int], count: int = 1500) -> Cloud:
+def capsule_points(capsules: F64, colour: Sequence[int]) -> Cloud:
     """Return points on the surfaces of capsules, spread evenly.
 
     Args:
         capsules: (n, 7).
         colour: RGB.
-        count: Points per capsule.
     """
-    number = np.arange(count) + 0.5
-    up, turn = 1.0 - 2.0 * number / count, number * math.pi * (3.0 - math.sqrt(5.0))
+    number = np.arange(CAPSULE_POINTS) + 0.5
+    up, turn = 1.0 - 2.0 * number / CAPSULE_POINTS, number * math.pi * (3.0 - math.sqrt(5.0))
     round_ = np.sqrt(1.0 - up * up)
     sphere = np.stack([round_ * np.cos(turn), round_ * np.sin(turn), up], 1)
     points, normals = [np.empty((0, 3))], [np.empty((0, 3))]
@@ -233,7 +229,7 @@ def capsule_points(capsules: F64, colour: Sequence[int], count: int = 1500) -> C
         if length > 1e-6:
             across = np.linalg.svd(axis[None] / length)[2][1:]
             ring = np.cos(turn)[:, None] * across[0] + np.sin(turn)[:, None] * across[1]
-            points.append(one + (number / count)[:, None] * axis + radius * ring)
+            points.append(one + (number / CAPSULE_POINTS)[:, None] * axis + radius * ring)
             normals.append(ring)
     return shaded(np.concatenate(points), np.concatenate(normals), colour)
 

@@ -63,14 +63,7 @@ class Line:
 
 
 def plan_figure(trace: Trace, truth: Truth, hull: Hull, stamp_ns: int) -> Picture:
-    """Show the cell from above: hull, arm, tracks, predictions, path, and the truth as outlines.
-
-    Args:
-        trace: What was recorded.
-        truth: What really was.
-        hull: The hull of the moment.
-        stamp_ns: The moment.
-    """
+    """Show the cell from above: hull, arm, tracks, predictions, path, and the truth as outlines."""
     import cv2
 
     sheet = np.full((PLAN_PX, PLAN_PX, 3), 252, np.uint8)

@@ -179,9 +179,6 @@ def _held(datum: Datum, datum_type: type[T]) -> T | Packed[T]:
 def trace_of(path: Path) -> Trace:
     """Read the recording of a run.
 
-    Args:
-        path: The MCAP file.
-
     Raises:
         ConfigError: The file is no recording, or cannot be read.
     """

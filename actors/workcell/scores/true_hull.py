@@ -75,13 +75,7 @@ class TrueVoxels:
 
 
 class TrueHull:
-    """What an oracle and a fixed zone go by.
-
-    Args:
-        scenario: What plays.
-        grid: The voxels.
-        arm: The arm.
-    """
+    """What an oracle and a fixed zone go by."""
 
     def __init__(self, scenario: Scenario, grid: Grid, arm: ArmModel) -> None:
         self._stage, self._arm = Stage(scenario), arm

@@ -78,10 +78,6 @@ class Posture:
 def body(posture: Posture, height_m: float = 1.75) -> F64:
     """Return a body.
 
-    Args:
-        posture: What it does.
-        height_m: Height of the person, metres.
-
     Returns:
         (17, 7) capsules, cell frame: end, end, radius; metres.
     """

@@ -27,13 +27,11 @@ class Scene:
         capsules: (n, 7), cell: the arm first, then the people in order.
         colours: (n, 3), blue, green, red, 0 to 1.
         boxes: Static boxes in the room.
-        brightness: Of the images; 1 as in the learned backgrounds.
     """
 
     capsules: F64
     colours: F64
     boxes: tuple[Box, ...]
-    brightness: float
 
 
 class Stage:
@@ -93,5 +91,4 @@ class Stage:
             capsules=np.concatenate([arm, *bodies.values()]),
             colours=np.concatenate(colours) if colours else np.empty((0, 3)),
             boxes=self.boxes + self.things_at(at_s),
-            brightness=self.brightness_at(at_s),
         )

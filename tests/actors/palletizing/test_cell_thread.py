@@ -23,14 +23,16 @@ def test_cell_runs_by_itself():
         running.arm.start()
         goal = np.array(HOME_RAD) + 0.2
         running.arm.command(goal)
-        assert running.feed() == 0
-        running.run_belt()
+        with running.stopped() as cell:
+            assert cell.feed() == 0
+            cell.run_belt()
 
         running.wait_cycles(1000)
 
-        assert running.arrived()
-        assert running.truth().packages[0].where == "belt"
-        assert [package.number for package in running.shown().packages] == [0]
+        with running.stopped() as cell:
+            assert cell.arrived()
+            assert cell.truth().packages[0].where == "belt"
+            assert [package.number for package in cell.shown().packages] == [0]
         np.testing.assert_allclose(running.arm.measured().q, goal, atol=1e-3)
 
 
@@ -55,15 +57,16 @@ def test_time_stands_still_in_a_block():
         running.wait_cycles(2)
 
         assert first == second
-        assert running.truth().at_s > second
+        with running.stopped() as cell:
+            assert cell.time_s > second
 
 
 def test_ended_cell_says_so():
     """After its end, and after an error inside, every call is one line with the cause."""
     with RunningCell(PhysicalCell([carton()], seed=1)) as running:
         running.wait_cycles(1)
-    with pytest.raises(ControllerError, match="the physical cell does not run"):
-        running.truth()
+    with pytest.raises(ControllerError, match="the physical cell does not run"), running.stopped():
+        pass
 
     broken = PhysicalCell([carton()], seed=1)
     broken.step = lambda: 1 / 0

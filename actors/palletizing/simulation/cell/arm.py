@@ -54,7 +54,6 @@ FINGER_M_S: Final = 0.08
 NOISE_N: Final = 0.05
 NOISE_NM: Final = 0.002
 """Standard deviations of the wrist sensor, per axis and cycle."""
-_SECONDS_TO_NS: Final = 1_000_000_000
 
 
 class JointLimiter:
@@ -161,7 +160,26 @@ class JointLimiter:
         return (q if goal is None else q + goal), dq + speed, ddq
 
 
-class SimulatedArm:
+class ArmOfCell:
+    """What is known of the cell's arm without asking it."""
+
+    @property
+    def cycle_s(self) -> float:
+        """Period of control."""
+        return CYCLE_S
+
+    @property
+    def model(self) -> Arm:
+        """Kinematics and limits."""
+        return ARM
+
+    @property
+    def posture_rad(self) -> F64:
+        """Where the joints go as far as the tool leaves it open."""
+        return np.array(HOME_RAD)
+
+
+class SimulatedArm(ArmOfCell):
     """Arm and gripper of the cell: an `ArmController` and a `GripperController` in one.
 
     Args:
@@ -197,21 +215,6 @@ class SimulatedArm:
         self._finger_m = (OPEN_M[1] - OPEN_M[0]) / 2.0
         self._measured: Measured | None = None
         self.gripping, self.gripping_cycles = False, 0
-
-    @property
-    def cycle_s(self) -> float:
-        """Period of control."""
-        return CYCLE_S
-
-    @property
-    def model(self) -> Arm:
-        """Kinematics and limits."""
-        return ARM
-
-    @property
-    def posture_rad(self) -> F64:
-        """Where the joints go as far as the tool leaves it open."""
-        return np.array(HOME_RAD)
 
     @property
     def limiter(self) -> JointLimiter:

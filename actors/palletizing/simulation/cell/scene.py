@@ -97,6 +97,14 @@ class CellLayout:
     base_from_bin: F64 = field(default_factory=lambda: _at(0.25, -0.66, z_m=-0.09))
     rim_m: float = 0.030
 
+    def frames(self) -> dict[str, F64]:
+        """Return base_from_entity of tray, belt and reject bin by name."""
+        return {
+            "tray": self.base_from_tray,
+            "belt": self.base_from_belt,
+            "bin": self.base_from_bin,
+        }
+
     def areas(self) -> dict[str, tuple[F64, F64]]:
         """Return where packages can lie: frame (4, 4), least and greatest (x, y) in it (2, 2)."""
         tray, bin_half = np.array(TRAY_M) / 2.0, np.array(BIN_HALF_M)

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from actors.palletizing.simulation.cell.arm import SimulatedArm
-    from actors.palletizing.simulation.cell.truth import CellTruth, ShownCell
     from actors.palletizing.simulation.physics import PhysicalCell
 
 LATE_S: Final = 0.05
@@ -33,7 +32,7 @@ LATE_S: Final = 0.05
 
 
 class RunningCell:
-    """A physical cell whose time runs by itself; also a `BeltController`.
+    """A physical cell whose time runs by itself.
 
     Args:
         cell: The cell; no other thread steps it from now on.
@@ -99,40 +98,6 @@ class RunningCell:
             while self._cell.time_s < until_s:
                 self._check()
                 self._between.wait(1.0)
-
-    def run_belt(self) -> None:
-        """Move the belt until a package interrupts the light barrier."""
-        with self.stopped() as cell:
-            cell.run_belt()
-
-    def stop_belt(self) -> None:
-        """Stop the belt."""
-        with self.stopped() as cell:
-            cell.stop_belt()
-
-    def arrived(self) -> bool:
-        """Return whether a package stands in the light barrier, the belt at rest."""
-        with self.stopped() as cell:
-            return cell.arrived()
-
-    def feed(self) -> int:
-        """Put the next package onto the start of the belt; return its number.
-
-        Raises:
-            ControllerError: No package is left, or one stands where it would come.
-        """
-        with self.stopped() as cell:
-            return cell.feed()
-
-    def truth(self) -> CellTruth:
-        """Return what is true now."""
-        with self.stopped() as cell:
-            return cell.truth()
-
-    def shown(self) -> ShownCell:
-        """Return what a sensor can see now."""
-        with self.stopped() as cell:
-            return cell.shown()
 
     def _check(self) -> None:
         if self._error is not None:

@@ -68,11 +68,7 @@ _NO_NAMES: Final = np.empty((0, 0), np.int16)
 
 
 class Painter:
-    """Draws moving capsules over the still pictures of one camera.
-
-    Attributes:
-        calibration: The camera.
-    """
+    """Draws moving capsules over the still pictures of one camera."""
 
     def __init__(self, calibration: Calibration) -> None:
         self.calibration = calibration
@@ -174,11 +170,7 @@ def person_colours(number: int) -> F64:
 
 
 class View:
-    """One simulated camera: its backdrops and its painter.
-
-    Attributes:
-        calibration: The camera.
-    """
+    """One simulated camera: its backdrops and its painter."""
 
     def __init__(self, calibration: Calibration, seed: int) -> None:
         self.calibration = calibration
