@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from slots import get as seen
 
 from actors.palletizing.real.recorded import (
     COLOUR,
@@ -14,18 +15,11 @@ from actors.palletizing.real.recorded import (
 )
 from actors.palletizing.reconstruction import Reconstruction
 from actors.palletizing.vocabulary import CLOUD, SCAN, VIEWPOINT, product_entity, view_entity
-from enact_dist import View
 from enact_dist.testing import run_once, worlds
 
 pytest.importorskip("open3d", exc_type=ImportError)
 
 MODEL = product_entity(RECORDED)
-
-
-def seen(world, entity, aspect):
-    """Return a datum of a world context, or None."""
-    request = View(world, entity, aspect)
-    return world.view(request).get(request, None)
 
 
 def test_perception_writes_one_view_per_update_and_then_rests(recording):

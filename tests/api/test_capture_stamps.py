@@ -4,6 +4,7 @@ import threading
 
 import numpy as np
 import pytest
+from slots import put
 
 from enact_dist import testing
 from enact_dist.access.lock import Lock
@@ -33,12 +34,6 @@ def stamp(world, entity, aspect):
     view = View(world, entity, aspect)
     with Lock(view) as lock:
         return lock.stamp_ns(view)
-
-
-def put(world, entity, aspect, datum, stamp_ns):
-    write = Write(world, entity, aspect)
-    with Lock(write) as lock:
-        lock.put(write, datum, stamp_ns=stamp_ns)
 
 
 class Detector(Actor):

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from slots import delete, put
 
 from enact_dist import Aspect, Entity, Lock, Write, local
 from enact_dist.compare.diff import DiffKind
@@ -26,18 +27,6 @@ class Seen:
 
 
 SEEN = Aspect("seen", Seen, compare=Tolerance(fields={"captured_ns": None}))
-
-
-def put(world, entity, aspect, datum):
-    request = Write(world, entity, aspect)
-    with Lock(request) as lock:
-        lock[request] = datum
-
-
-def delete(world, entity, aspect):
-    request = Write(world, entity, aspect)
-    with Lock(request) as lock:
-        del lock[request]
 
 
 @pytest.fixture

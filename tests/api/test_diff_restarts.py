@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 from ports import free_endpoint
+from slots import put
 
-from enact_dist import Aspect, Durability, Entity, Lock, Tolerance, Write, connect
+from enact_dist import Aspect, Durability, Entity, Tolerance, connect
 from enact_dist.core.protocol.messages import PlacementMap, ShardEntry
 from enact_dist.core.shard.state import ShardSettings
 from enact_dist.errors import ForgottenError
@@ -15,13 +16,6 @@ SHIFT = Aspect("shift_mm", float, compare=Tolerance(absolute=0.5))
 SEEN = Aspect("seen", np.ndarray, Durability.VOLATILE)
 piece = Entity("piece")
 SOON_S = 30.0
-
-
-def put(world, entity, aspect, datum):
-    request = Write(world, entity, aspect)
-    with Lock(request) as lock:
-        lock[request] = datum
-    return lock.position
 
 
 @pytest.fixture

@@ -3,6 +3,7 @@
 import threading
 
 import pytest
+from slots import delete, put
 
 from enact_dist import Aspect, Entity, Lock, Write, local
 from enact_dist.comparing import Tolerance
@@ -14,18 +15,6 @@ SHIFT = Aspect("shift_mm", float, compare=Tolerance(absolute=0.5, unit="mm"))
 COUNT = Aspect("count", int)
 piece, bench = Entity("piece"), Entity("bench")
 SOON_S = 30.0
-
-
-def put(world, entity, aspect, datum):
-    request = Write(world, entity, aspect)
-    with Lock(request) as lock:
-        lock[request] = datum
-
-
-def delete(world, entity, aspect):
-    request = Write(world, entity, aspect)
-    with Lock(request) as lock:
-        del lock[request]
 
 
 @pytest.fixture

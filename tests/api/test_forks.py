@@ -6,6 +6,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
+from counted import COUNT, put, value_of
 
 from enact_dist import (
     Aspect,
@@ -31,22 +32,9 @@ from enact_dist.link.client.session import SessionClient
 
 pytestmark = pytest.mark.carrier("local", "drawn")
 
-COUNT = Aspect("count", int)
 CLOUD = Aspect("cloud", np.ndarray)
 LEFT, RIGHT = Entity("left/arm"), Entity("right/arm")
 ARM = Entity("arm")
-
-
-def put(world, entity, value, aspect=COUNT):
-    request = Write(world, entity, aspect)
-    with Lock(request) as lock:
-        lock[request] = value
-    return lock.position
-
-
-def value_of(world, entity, aspect=COUNT):
-    request = View(world, entity, aspect)
-    return world.view(request)[request]
 
 
 def test_fork_has_the_data_of_its_source_and_a_life_of_its_own(cell, online):

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
+from slots import datum_of as seen
+from slots import put
 
 from enact_dist import (
     Aspect,
@@ -71,17 +73,6 @@ def old(x_mm):
 def new(x_mm):
     joints = [NEW_JOINT(x_mm / 10, 2.0)]
     return NEW(frame="tool", x_mm=x_mm, joints=joints, cloud=np.ones(2))
-
-
-def put(world, entity, aspect, value):
-    with Lock(Write(world, entity, aspect)) as lock:
-        lock[Write(world, entity, aspect)] = value
-    return lock.position
-
-
-def seen(world, entity, aspect):
-    request = View(world, entity, aspect)
-    return world.view(request)[request]
 
 
 @pytest.fixture

@@ -4,24 +4,17 @@ import time
 
 import numpy as np
 import pytest
+from counted import COUNT, put
 
 from enact_dist import Aspect, Durability, Entity, Lock, Write
 from enact_dist.errors import ForgottenError, MisuseError, NullDatumError, UnknownWorldError
 
 pytestmark = pytest.mark.carrier("local", "drawn")
 
-COUNT = Aspect("count", int)
 CLOUD = Aspect("cloud", np.ndarray, Durability.VOLATILE)
 FLEETING = Aspect("fleeting", int, Durability.VOLATILE, retention=2)
 ARM, LEG = Entity("arm"), Entity("leg")
 LEFT, RIGHT = Entity("left/arm"), Entity("right/arm")
-
-
-def put(world, entity, value, aspect=COUNT, *, stamp_ns=0):
-    request = Write(world, entity, aspect)
-    with Lock(request) as lock:
-        lock.put(request, value, stamp_ns=stamp_ns)
-    return lock.position
 
 
 def test_history_lists_versions_oldest_first_with_where_they_stand(online):

@@ -5,6 +5,7 @@ from datetime import UTC, datetime, timedelta, timezone
 
 import numpy as np
 import pytest
+from counted import COUNT, delete, put, value_of
 
 from enact_dist import (
     Aspect,
@@ -31,30 +32,10 @@ from enact_dist.errors import (
 
 pytestmark = pytest.mark.carrier("local", "drawn")
 
-COUNT = Aspect("count", int)
 CLOUD = Aspect("cloud", np.ndarray, Durability.VOLATILE)
 FLEETING = Aspect("fleeting", int, Durability.VOLATILE, retention=3)
 ARM, LEG = Entity("arm"), Entity("leg")
 LEFT, RIGHT = Entity("left/arm"), Entity("right/arm")
-
-
-def put(world, entity, value, aspect=COUNT, *, stamp_ns=0):
-    request = Write(world, entity, aspect)
-    with Lock(request) as lock:
-        lock.put(request, value, stamp_ns=stamp_ns)
-    return lock.position
-
-
-def delete(world, entity, aspect=COUNT):
-    request = Write(world, entity, aspect)
-    with Lock(request) as lock:
-        del lock[request]
-    return lock.position
-
-
-def value_of(world, entity, aspect=COUNT):
-    request = View(world, entity, aspect)
-    return world.view(request)[request]
 
 
 def each_of(world, pattern="**", aspect=COUNT):

@@ -13,6 +13,12 @@ from shard_bench import ShardBench
 
 
 @pytest.fixture
-def bench() -> ShardBench:
-    """A shard with one aspect of each durability, on a disk that is done at once."""
-    return ShardBench()
+def bench(request) -> ShardBench:
+    """A shard with one aspect of each durability, on a disk that is done at once.
+
+    A module says by SESSIONS which sessions are open from the start, and by BENCH of which kind it
+    is.
+    """
+    made = getattr(request.module, "BENCH", ShardBench)()
+    made.hello(*getattr(request.module, "SESSIONS", ()))
+    return made

@@ -1,16 +1,31 @@
 """Small wrong edits of the shard, each of which the machine must notice.
 
 A mutant replaces one decision of the core through `patch(owner, name, value)`; the shard's own
-assertions are off meanwhile.
+assertions are off meanwhile.  Those that the simulator catches too are in `tests/sim`.
 """
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
+sys.path.append(str(Path(__file__).parents[1] / "sim"))
+
+from mutants_directed import leases_end_late
+from mutants_one_shard import blind_acknowledgement, no_grace, shows_before_it_is_kept
+from mutants_over_shards import (
+    aborts_what_is_open,
+    expects_beside_writers,
+    forgets_decisions_at_a_restart,
+    loses_prepared_at_a_restart,
+    views_do_not_wait_for_the_undecided,
+)
+from mutants_readers import shows_the_newest_for_what_is_gone
+
 from enact_dist.core.protocol.messages import NOT_KEPT, Fenced, Finished, Prepared
-from enact_dist.core.protocol.records import Content, Persist, Reply
+from enact_dist.core.protocol.records import Persist, Reply
 from enact_dist.core.shard.on_lock import LockDesk
 from enact_dist.core.shard.on_prepare import PrepareDesk
 from enact_dist.core.shard.on_session import SessionDesk
@@ -20,16 +35,8 @@ from enact_dist.core.state.commits import Commits
 from enact_dist.core.state.decisions import Decisions
 from enact_dist.core.state.grants import Tenures
 from enact_dist.core.state.history import History
-from enact_dist.core.state.sessions import SessionState, SessionTable
-from enact_dist.core.state.slots import SlotMap
+from enact_dist.core.state.sessions import SessionTable
 from enact_dist.core.state.tenure import KeptGrants, Tenure
-from enact_dist.terms import NullReason
-
-
-def lease_ends_a_nanosecond_late(patch):
-    """A lease lives one nanosecond too long."""
-    lease_end_ns = SessionState.lease_end_ns
-    patch(SessionState, "lease_end_ns", lambda session, now_ns: lease_end_ns(session, now_ns) + 1)
 
 
 def any_token_of_this_epoch(patch):
@@ -105,29 +112,6 @@ def finished_before_it_is_kept(patch):
     _tells_early(patch, "_finish", lambda record: Finished(record.lock))
 
 
-def aborts_what_is_open(patch):
-    """A primary that has not decided yet says that it never will."""
-    resolved = PrepareDesk._resolved
-
-    def wrong(self, message):
-        answer = resolved(self, message)
-        return replace(answer, kind="aborted") if answer.kind == "open" else answer
-
-    patch(PrepareDesk, "_resolved", wrong)
-
-
-def forgets_what_is_decided(patch):
-    """Whoever asks about a committed lock is told that it never was."""
-    patch(Commits, "position_of", lambda _self, _lock: None)
-
-
-def loses_prepared_at_a_restart(patch):
-    """A restarted participant has forgotten what it has prepared."""
-    init = PrepareDesk.__init__
-    wrong = lambda self, state, _recovered, *others: init(self, state, (), *others)  # noqa: E731
-    patch(PrepareDesk, "__init__", wrong)
-
-
 def tells_participants_once(patch):
     """Who does not hear of a decision at once never does."""
     tell = Decisions.tell
@@ -138,23 +122,6 @@ def tells_participants_once(patch):
             decision.due_ns = 1 << 62
 
     patch(Decisions, "tell", wrong)
-
-
-def blind_acknowledgement(patch):
-    """Any hello counts as an acknowledgement of the new epoch."""
-    hello = SessionTable.hello
-
-    def wrong(self, message, **options):
-        session, unrecorded = hello(self, message, **options)
-        session.acknowledged = True
-        return session, unrecorded
-
-    patch(SessionTable, "hello", wrong)
-
-
-def no_grace(patch):
-    """A restarted shard grants at once."""
-    patch(SessionTable, "in_grace", lambda _table, _now_ns: False)
 
 
 def leases_pay_for_a_stall(patch):
@@ -181,19 +148,9 @@ def validated_once(patch):
     patch(Commits, "validate", wrong)
 
 
-def expects_beside_writers(patch):
-    """An expected view does not mind that another lock may write it."""
-    patch(Commits, "_in_the_way", lambda _self, _slot, _lock: False)
-
-
 def expects_what_was(patch):
     """An expected view is compared with what is visible, not with what is at the disk."""
     patch(Commits, "_newest_version", lambda self, slot: self._slots[slot].version)
-
-
-def views_promise_too_much(patch):
-    """A view's end does not mind what is undecided."""
-    patch(ViewDesk, "_undecided_ns", lambda _desk, _items: 1 << 62)
 
 
 def stamps_follow_the_wall_clock(patch):
@@ -226,19 +183,6 @@ def vanished_waiters_keep_their_place(patch):
     patch(SessionDesk, "on_session_seen", wrong)
 
 
-def shows_before_it_is_kept(patch):
-    """Readers see a commit while the disk still works on it."""
-    make_durable = Commits._make_durable
-
-    def wrong(self, commit, *, now_ns):
-        for write, (slot, version) in zip(commit.writes, commit.outcome.versions, strict=True):
-            stamp_ns = commit.outcome.position.stamp_ns
-            self._slots.set(slot, Content(version, stamp_ns, write.datum, NullReason.DELETED))
-        yield from make_durable(self, commit, now_ns=now_ns)
-
-    patch(Commits, "_make_durable", wrong)
-
-
 def welcomes_early(patch):
     """A session is welcomed before its record is on disk."""
     answer_when_durable = SessionDesk.answer_when_durable
@@ -261,17 +205,6 @@ def retains_one_version_more(patch):
         append(self, found, old, limits._replace(versions=more))
 
     patch(History, "_append", wrong)
-
-
-def shows_another_stamp(patch):
-    """Where nothing of a stamp is retained, the newest version is shown."""
-    captured = SlotMap.captured
-
-    def wrong(self, slot, newest, captured_ns, **options):
-        found = captured(self, slot, newest, captured_ns, **options)
-        return found if found.datum is not None else newest
-
-    patch(SlotMap, "captured", wrong)
 
 
 def any_seq_under_a_kept_grant(patch):
@@ -339,8 +272,8 @@ ALL = (
     cell_is_not_cleared,
     revokes_what_a_block_uses,
     retains_one_version_more,
-    shows_another_stamp,
-    lease_ends_a_nanosecond_late,
+    shows_the_newest_for_what_is_gone,
+    leases_end_late,
     any_token_of_this_epoch,
     grants_a_seq_again,
     view_does_not_renew,
@@ -349,7 +282,7 @@ ALL = (
     promises_before_it_is_kept,
     finished_before_it_is_kept,
     aborts_what_is_open,
-    forgets_what_is_decided,
+    forgets_decisions_at_a_restart,
     loses_prepared_at_a_restart,
     tells_participants_once,
     blind_acknowledgement,
@@ -359,7 +292,7 @@ ALL = (
     validated_once,
     expects_beside_writers,
     expects_what_was,
-    views_promise_too_much,
+    views_do_not_wait_for_the_undecided,
     stamps_follow_the_wall_clock,
     keep_alives_free_nothing,
     vanished_waiters_keep_their_place,

@@ -33,14 +33,7 @@ from enact_dist.wire.frames import encode_frame
 
 MIB = 1 << 20
 HELLO = Hello("bob", 0, 10**9, "", "", 0, True)
-
-
-@pytest.fixture
-def bench():
-    """A shard with two world contexts and three aspects, and a session."""
-    bench = ShardBench()
-    bench.hello("ann")
-    return bench
+SESSIONS = ("ann",)
 
 
 def register(bench, worlds=(), aspects=()):

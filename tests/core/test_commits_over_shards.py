@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 from prepare_parts import ANN, FAR_TOKEN, STAMP_NS, R, W, called, prepare_of, prepared
-from shard_bench import MS, TTL_NS, S, ShardBench, item, lock_id, slot
+from shard_bench import MS, TTL_NS, S, item, lock_id, slot
 
 from enact_dist.core.protocol.datum import Position
 from enact_dist.core.protocol.messages import (
@@ -37,12 +37,7 @@ from enact_dist.core.protocol.records import (
     Tick,
 )
 
-
-@pytest.fixture
-def bench() -> ShardBench:
-    bench = ShardBench()
-    bench.hello("ann", "bob")
-    return bench
+SESSIONS = "ann", "bob"
 
 
 class TestPrepare:

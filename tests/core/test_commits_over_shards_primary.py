@@ -42,12 +42,7 @@ from enact_dist.core.protocol.records import (
 )
 from enact_dist.core.state.decisions import AGAIN_NS_MIN
 
-
-@pytest.fixture
-def bench() -> ShardBench:
-    bench = ShardBench()
-    bench.hello("ann", "bob")
-    return bench
+SESSIONS = "ann", "bob"
 
 
 class TestPrimary:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from shard_bench import ShardBench, item, lock_id, slot
+from shard_bench import item, lock_id, slot
 from world_parts import V, W, content, drop, fork, of, write
 
 from enact_dist.core.protocol.datum import Position, Token
@@ -29,13 +29,7 @@ from enact_dist.core.protocol.messages import (
 from enact_dist.core.protocol.records import KeptRecord, WorldDropped
 from enact_dist.core.shard.on_world import CHANGES_MAX
 
-
-@pytest.fixture
-def bench():
-    """Return a shard with one session."""
-    made = ShardBench()
-    made.hello("ann")
-    return made
+SESSIONS = ("ann",)
 
 
 def test_dropped_context_is_gone_with_all_its_slots(bench):

@@ -27,13 +27,7 @@ from enact_dist.terms import Access
 
 BIG = (1 << 63) - 1
 FAR_AHEAD = [2 * S, 3600 * S, BIG]
-
-
-@pytest.fixture
-def bench() -> ShardBench:
-    bench = ShardBench()
-    bench.hello("ann", "bob")
-    return bench
+SESSIONS = "ann", "bob"
 
 
 def far(bench: ShardBench, ahead_ns: int) -> Position:

@@ -6,7 +6,7 @@ import pytest
 from history_parts import SEC, VE, V, W, as_of, capture, listed, retain, shown, write
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from shard_bench import S, ShardBench, datum, item, lock_id, slot
+from shard_bench import S, datum, item, lock_id, slot
 
 from enact_dist.core.protocol.datum import Datum
 from enact_dist.core.protocol.messages import (
@@ -27,13 +27,7 @@ from enact_dist.core.state.retention import Limits
 from enact_dist.core.state.slots import SlotMap
 from enact_dist.terms import NullReason
 
-
-@pytest.fixture
-def bench() -> ShardBench:
-    """A shard with one session; `count` is durable, `note` of class `os`, `frame` volatile."""
-    made = ShardBench()
-    made.hello("ann")
-    return made
+SESSIONS = ("ann",)
 
 
 class TestAsOfAStamp:

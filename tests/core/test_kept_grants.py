@@ -32,14 +32,8 @@ from enact_dist.core.state.tenure import KEPT_ITEMS_MAX, ROW_MIN
 from enact_dist.terms import Access
 
 COUNT = slot()
-
-
-@pytest.fixture
-def bench() -> KeepingBench:
-    """Two sessions at a shard that sees the use of grants."""
-    bench = KeepingBench()
-    bench.hello("ann", "bob")
-    return bench
+BENCH = KeepingBench
+SESSIONS = "ann", "bob"
 
 
 class TestStays:

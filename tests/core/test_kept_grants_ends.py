@@ -30,14 +30,8 @@ from enact_dist.core.state.tenure import CAUSES_MAX, HABITS_MAX, KEPT_OF_SESSION
 from enact_dist.terms import Access
 
 COUNT = slot()
-
-
-@pytest.fixture
-def bench() -> KeepingBench:
-    """Two sessions at a shard that sees the use of grants."""
-    bench = KeepingBench()
-    bench.hello("ann", "bob")
-    return bench
+BENCH = KeepingBench
+SESSIONS = "ann", "bob"
 
 
 def released(bench, kept):

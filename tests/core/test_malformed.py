@@ -32,13 +32,7 @@ W = Access.WRITE
 ANN = lock_id("ann")
 FAR_TOKEN = Token(7, 7)
 WRITES = (WriteItem(slot(), datum("new")),)
-
-
-@pytest.fixture
-def bench() -> ShardBench:
-    bench = ShardBench()
-    bench.hello("ann", "bob")
-    return bench
+SESSIONS = "ann", "bob"
 
 
 def refused(answer: object, match: str) -> None:

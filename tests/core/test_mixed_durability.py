@@ -19,13 +19,7 @@ from enact_dist.core.protocol.records import DecisionRecord, PreparedEnded, Prep
 from enact_dist.terms import Access, Durability
 
 ANN = lock_id("ann")
-
-
-@pytest.fixture
-def bench() -> ShardBench:
-    bench = ShardBench()
-    bench.hello("ann", "bob")
-    return bench
+SESSIONS = "ann", "bob"
 
 
 def granted(bench: ShardBench, aspect: str) -> tuple[Granted, tuple[WriteItem, ...]]:

@@ -30,13 +30,7 @@ from enact_dist.core.shard.on_view import OF_A_SESSION_MAX
 from enact_dist.terms import Access
 
 ANN = lock_id("ann")
-
-
-@pytest.fixture
-def bench() -> ShardBench:
-    bench = ShardBench()
-    bench.hello("ann", "bob")
-    return bench
+SESSIONS = "ann", "bob"
 
 
 def far_ns(bench: ShardBench) -> int:

@@ -22,13 +22,7 @@ from enact_dist.core.state.retention import Limits
 from enact_dist.core.state.slots import SlotMap
 from enact_dist.terms import NullReason
 
-
-@pytest.fixture
-def bench() -> ShardBench:
-    """A shard with one session; `count` is durable, `note` of class `os`, `frame` volatile."""
-    made = ShardBench()
-    made.hello("ann")
-    return made
+SESSIONS = ("ann",)
 
 
 class TestRetention:

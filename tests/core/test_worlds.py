@@ -33,13 +33,7 @@ from enact_dist.core.protocol.records import NOTHING, SlotRecord, WorldRecord
 from enact_dist.core.shard.on_world import CHANGES_MAX, FORK_WAIT_NS
 from enact_dist.terms import NullReason
 
-
-@pytest.fixture
-def bench():
-    """Return a shard with one session."""
-    made = ShardBench()
-    made.hello("ann")
-    return made
+SESSIONS = ("ann",)
 
 
 # ---------------------------------------------------------------- what a fork is

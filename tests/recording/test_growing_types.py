@@ -4,8 +4,10 @@ import threading
 from dataclasses import dataclass
 
 import pytest
+from slots import datum_of as seen
+from slots import put
 
-from enact_dist import Aspect, Entity, Lock, View, Write, local
+from enact_dist import Aspect, Entity, local
 from enact_dist.errors import DatumTypeError
 from enact_dist.recording import Recorder, Replay
 from enact_dist.recording.reading import Recording
@@ -21,15 +23,6 @@ def spot(**fields):
 
 Old, New = spot(), spot(name="spot")
 OLD, NEW = Aspect("spot", Old), Aspect("spot", New)
-
-
-def put(world, entity, aspect, value):
-    with Lock(Write(world, entity, aspect)) as lock:
-        lock[Write(world, entity, aspect)] = value
-
-
-def seen(world, entity, aspect):
-    return world.view(View(world, entity, aspect))[View(world, entity, aspect)]
 
 
 @pytest.fixture

@@ -6,6 +6,9 @@ import pytest
 pytest.importorskip("open3d", exc_type=ImportError)
 pytest.importorskip("mujoco", exc_type=ImportError)
 
+from slots import each, get
+from slots import put_online as write
+
 from actors.geometry.poses import turned
 from actors.palletizing import vocabulary as words
 from actors.palletizing.deviation import DeviationDetection
@@ -19,7 +22,7 @@ from actors.palletizing.simulation.cell.scene import CellLayout
 from actors.palletizing.simulation.physical_sensors import PhysicalBeltSensor, PhysicalTraySensor
 from actors.palletizing.simulation.physics import PhysicalCell
 from actors.palletizing.training_grasp import TrainingGrasp
-from enact_dist import Entity, Lock, View, ViewEach, Write, testing
+from enact_dist import Entity, View, testing
 
 pytestmark = pytest.mark.sampled(9, of="file")
 
@@ -52,22 +55,6 @@ def cell(trained, physical, monkeypatch):
         yield cell
 
 
-def write(cell, entity, aspect, datum):
-    request = Write(cell.world("online"), entity, aspect)
-    with Lock(request) as lock:
-        lock[request] = datum
-
-
-def read(cell, entity, aspect):
-    request = View(cell.world("online"), entity, aspect)
-    return cell.world("online").view(request).get(request)
-
-
-def each(cell, world, pattern, aspect):
-    request = ViewEach(cell.world(world), pattern, aspect)
-    return dict(cell.world(world).view(request)[request])
-
-
 def ended(cell, number, package, place, *, stage="push", success=True, kind="pack", aside="aside"):
     """Let the robot have ended a request and gone aside."""
     request = words.Request(number, kind, place, package, "test", "tray" if package else "")
@@ -89,7 +76,7 @@ def on_belt(physical, number):
 
 
 def on_tray(cell, physical, number, *, beside_m=0.0):
-    plan = each(cell, "training", words.PLACES, words.PLAN)[Entity(f"place/{number}")]
+    plan = each(cell.world("training"), words.PLACES, words.PLAN)[Entity(f"place/{number}")]
     pose = np.array(plan.tray_from_product)
     pose[1, 3] += beside_m
     physical.put(number, LAYOUT.base_from_tray @ pose)
@@ -101,7 +88,7 @@ def arrived(cell, physical):
     on_belt(physical, 0)
     write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(0, 7))
     testing.run_once(perception, cell)
-    (package,) = each(cell, "online", words.PACKAGES, words.SIGHTING)
+    (package,) = each(cell.world("online"), words.PACKAGES, words.SIGHTING)
     return perception, package
 
 
@@ -111,7 +98,7 @@ def test_a_package_has_one_entity_from_the_belt_to_the_tray(cell, physical):
     true = on_belt(physical, 0)
     write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(0, 7))
     testing.run_once(perception, cell)
-    ((package, seen),) = each(cell, "online", words.PACKAGES, words.SIGHTING).items()
+    ((package, seen),) = each(cell.world("online"), words.PACKAGES, words.SIGHTING).items()
     assert (seen.product, seen.frame, seen.first_stop) == ("milk_carton", "belt", 0)
     found = LAYOUT.base_from_belt @ seen.frame_from_package
     assert np.hypot(*(found - true)[:2, 3]) < 0.012  # the sensor is off by some millimetres
@@ -120,13 +107,13 @@ def test_a_package_has_one_entity_from_the_belt_to_the_tray(cell, physical):
     ended(cell, 1, package.name, "place/0")
     testing.run_once(perception, cell)
     testing.run_once(detection, cell)
-    assert read(cell, words.SYSTEM, words.LOOK).seen == "tray"
-    assert read(cell, words.SYSTEM, words.DEVIATIONS)["place/0"].verdict == "ok"
+    assert get(cell.world("online"), words.SYSTEM, words.LOOK).seen == "tray"
+    assert get(cell.world("online"), words.SYSTEM, words.DEVIATIONS)["place/0"].verdict == "ok"
 
     on_belt(physical, 1)
     write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(1, 8))
     testing.run_once(perception, cell)
-    sightings = each(cell, "online", words.PACKAGES, words.SIGHTING)
+    sightings = each(cell.world("online"), words.PACKAGES, words.SIGHTING)
     (second,) = sightings.keys() - {package}
     assert sightings[second].product == "meal_tray"
     on_tray(cell, physical, 1)
@@ -134,13 +121,15 @@ def test_a_package_has_one_entity_from_the_belt_to_the_tray(cell, physical):
     ended(cell, 2, second.name, "place/1")
     testing.run_once(perception, cell)
     testing.run_once(detection, cell)
-    flags = read(cell, words.SYSTEM, words.DEVIATIONS)
+    flags = get(cell.world("online"), words.SYSTEM, words.DEVIATIONS)
     assert {place: flag.verdict for place, flag in flags.items()} == {
         "place/0": "moved",
         "place/1": "ok",
     }
-    assert len(each(cell, "online", words.PACKAGES, words.SIGHTING)) == 2
-    before_mm = each(cell, "online", words.PLACES, words.OBSERVATION)[Entity("place/1")].before_mm
+    assert len(each(cell.world("online"), words.PACKAGES, words.SIGHTING)) == 2
+    before_mm = each(cell.world("online"), words.PLACES, words.OBSERVATION)[
+        Entity("place/1")
+    ].before_mm
     assert (before_mm % 1.0 != 0.0).any()  # the neighbour is drawn as exactly as it was seen
 
 
@@ -149,9 +138,9 @@ def test_a_package_that_was_missed_is_seen_on_the_belt_again(cell, physical):
     perception, package = arrived(cell, physical)
     ended(cell, 1, package.name, "place/0", stage="grasp", success=False)
     testing.run_once(perception, cell)
-    look = read(cell, words.SYSTEM, words.LOOK)
+    look = get(cell.world("online"), words.SYSTEM, words.LOOK)
     assert (look.seen, look.captured_ns) == ("belt", 0)
-    assert each(cell, "online", words.PLACES, words.OBSERVATION) == {}
+    assert each(cell.world("online"), words.PLACES, words.OBSERVATION) == {}
 
 
 def test_a_package_that_is_nowhere_is_missing(cell, physical):
@@ -161,8 +150,8 @@ def test_a_package_that_is_nowhere_is_missing(cell, physical):
     ended(cell, 1, package.name, "place/0", stage="place", success=False)
     testing.run_once(perception, cell)
     testing.run_once(DeviationDetection(), cell)
-    assert read(cell, words.SYSTEM, words.LOOK).seen == ""
-    assert read(cell, words.SYSTEM, words.DEVIATIONS)["place/0"].verdict == "missing"
+    assert get(cell.world("online"), words.SYSTEM, words.LOOK).seen == ""
+    assert get(cell.world("online"), words.SYSTEM, words.DEVIATIONS)["place/0"].verdict == "missing"
 
 
 @pytest.mark.parametrize(
@@ -180,9 +169,9 @@ def test_a_package_that_was_lost_on_its_way_is_looked_for_on_the_belt(
     ended(cell, 1, package.name, "place/0", stage="place", success=False)
     testing.run_once(perception, cell)
     testing.run_once(DeviationDetection(), cell)
-    assert read(cell, words.SYSTEM, words.LOOK).seen == "belt"
-    assert read(cell, words.SYSTEM, words.DEVIATIONS)["place/0"].verdict == "missing"
-    seen = each(cell, "online", words.PACKAGES, words.SIGHTING)[package]
+    assert get(cell.world("online"), words.SYSTEM, words.LOOK).seen == "belt"
+    assert get(cell.world("online"), words.SYSTEM, words.DEVIATIONS)["place/0"].verdict == "missing"
+    seen = each(cell.world("online"), words.PACKAGES, words.SIGHTING)[package]
     assert (seen.frame, seen.product, seen.unfit) == ("belt", "milk_carton", unfit)
     off = LAYOUT.base_from_belt @ seen.frame_from_package - lies
     assert unfit or np.hypot(*off[:2, 3]) < 0.012
@@ -190,22 +179,22 @@ def test_a_package_that_was_lost_on_its_way_is_looked_for_on_the_belt(
     testing.run_once(perception, cell)
     ended(cell, 2, package.name, "place/0", stage="place", success=False)
     testing.run_once(perception, cell)
-    assert read(cell, words.SYSTEM, words.LOOK).seen == "", "it may be the next one"
+    assert get(cell.world("online"), words.SYSTEM, words.LOOK).seen == "", "it may be the next one"
 
 
 def test_a_package_in_the_hand_is_not_judged(cell, physical):
     """What could not be put down hangs above the tray and tells nothing of its place."""
     testing.run_once(TrainingGrasp("milk_carton=0.5 meal_tray=0.35"), cell)
     perception, package = arrived(cell, physical)
-    grasp = each(cell, "training", words.PRODUCTS, words.GRASP)[Entity("product/milk_carton")]
+    grasp = each(cell.world("training"), words.PRODUCTS, words.GRASP)[Entity("product/milk_carton")]
     ended(cell, 1, package.name, "place/0", stage="place", success=False)
     state = words.GripState(1, grasp.width_m - 0.002, 0.0, 40.0, 7)
     write(cell, words.GRIPPER, words.COMMAND, words.GripCommand(1, "force", 40.0))
     write(cell, words.GRIPPER, words.STATE, state)
     testing.run_once(perception, cell)
-    look = read(cell, words.SYSTEM, words.LOOK)
+    look = get(cell.world("online"), words.SYSTEM, words.LOOK)
     assert (look.seen, look.captured_ns, look.judged) == ("hand", 0, ())
-    assert each(cell, "online", words.PLACES, words.OBSERVATION) == {}
+    assert each(cell.world("online"), words.PLACES, words.OBSERVATION) == {}
 
 
 @pytest.mark.parametrize("result", ["blocked", "timeout:away", "interrupted:away"])
@@ -215,9 +204,9 @@ def test_an_arm_that_is_not_aside_hides_the_tray(cell, physical, result):
     on_tray(cell, physical, 0)
     ended(cell, 1, package.name, "place/0", aside=result)
     testing.run_once(perception, cell)
-    look = read(cell, words.SYSTEM, words.LOOK)
+    look = get(cell.world("online"), words.SYSTEM, words.LOOK)
     assert (look.judged, look.error) == ((), f"the arm is not aside: {result}")
-    assert each(cell, "online", words.PLACES, words.OBSERVATION) == {}
+    assert each(cell.world("online"), words.PLACES, words.OBSERVATION) == {}
 
 
 @pytest.mark.parametrize("kind", ["reject", "removed"])
@@ -232,7 +221,7 @@ def test_what_shall_be_gone_is_looked_for(cell, physical, kind, stays):
         physical.take_away(0)
     ended(cell, 2, package.name, "place/0", stage="remove", kind=kind)
     testing.run_once(perception, cell)
-    look = read(cell, words.SYSTEM, words.LOOK)
+    look = get(cell.world("online"), words.SYSTEM, words.LOOK)
     assert (look.request, look.seen, look.judged) == (2, "tray" if stays else "", ())
 
 
@@ -255,13 +244,13 @@ def test_a_tray_sensor_that_fails_is_named_and_nothing_is_judged(cell, physical,
     for number in (2, 3):
         ended(cell, number, package.name, "place/0", kind="look")
         testing.run_once(perception, cell)
-        look = read(cell, words.SYSTEM, words.LOOK)
+        look = get(cell.world("online"), words.SYSTEM, words.LOOK)
         assert (look.request, look.judged, look.error) == (number, (), error)
     physical.fail(kind, 0.0)
     ended(cell, 4, package.name, "place/0", kind="look")
     testing.run_once(perception, cell)
     testing.run_once(DeviationDetection(), cell)
-    assert read(cell, words.SYSTEM, words.DEVIATIONS)["place/0"].verdict == "moved"
+    assert get(cell.world("online"), words.SYSTEM, words.DEVIATIONS)["place/0"].verdict == "moved"
 
 
 @pytest.mark.parametrize("kind", ["blind", "camera"])
@@ -272,18 +261,18 @@ def test_a_package_that_the_belt_sensor_does_not_show_is_not_forgotten(cell, phy
     on_belt(physical, 0)
     write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(0, 7))
     testing.run_once(perception, cell)
-    assert each(cell, "online", words.PACKAGES, words.SIGHTING) == {}
-    sight = read(cell, words.CONVEYOR, words.SIGHT)
+    assert each(cell.world("online"), words.PACKAGES, words.SIGHTING) == {}
+    sight = get(cell.world("online"), words.CONVEYOR, words.SIGHT)
     assert sight.number == 0
     assert sight.error.startswith("the belt sensor ")
     ended(cell, 1, "", "place/0", kind="look")
     testing.run_once(perception, cell)
-    assert read(cell, words.SYSTEM, words.LOOK).error.startswith("the belt sensor ")
+    assert get(cell.world("online"), words.SYSTEM, words.LOOK).error.startswith("the belt sensor ")
     physical.fail(kind, 0.0)
     ended(cell, 2, "", "place/0", kind="look")
     testing.run_once(perception, cell)
-    assert read(cell, words.SYSTEM, words.LOOK).error == ""
-    assert len(each(cell, "online", words.PACKAGES, words.SIGHTING)) == 1
+    assert get(cell.world("online"), words.SYSTEM, words.LOOK).error == ""
+    assert len(each(cell.world("online"), words.PACKAGES, words.SIGHTING)) == 1
 
 
 def test_what_is_seen_again_and_again_nowhere_is_reported(cell, physical):
@@ -293,14 +282,14 @@ def test_what_is_seen_again_and_again_nowhere_is_reported(cell, physical):
     for stamp_ns in range(1, UNSEEN_LOOKS + 1):
         write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(0, stamp_ns))
         testing.run_once(perception, cell)
-        sight = read(cell, words.CONVEYOR, words.SIGHT)
+        sight = get(cell.world("online"), words.CONVEYOR, words.SIGHT)
         errors.append("" if sight is None else sight.error)
     assert errors == [*[""] * (UNSEEN_LOOKS - 1), UNRECOGNISED]
     on_belt(physical, 0)
     write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(0, UNSEEN_LOOKS + 1))
     testing.run_once(perception, cell)
-    assert read(cell, words.CONVEYOR, words.SIGHT).error == ""
-    assert len(each(cell, "online", words.PACKAGES, words.SIGHTING)) == 1
+    assert get(cell.world("online"), words.CONVEYOR, words.SIGHT).error == ""
+    assert len(each(cell.world("online"), words.PACKAGES, words.SIGHTING)) == 1
 
 
 def test_what_was_taken_out_of_the_light_barrier_is_reported_at_once(cell, physical):
@@ -308,12 +297,12 @@ def test_what_was_taken_out_of_the_light_barrier_is_reported_at_once(cell, physi
     perception = HandlingPerception("belt", "tray", frames=2)
     write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(0, 1, is_gone=True))
     testing.run_once(perception, cell)
-    assert read(cell, words.CONVEYOR, words.SIGHT).error == TAKEN_OUT
+    assert get(cell.world("online"), words.CONVEYOR, words.SIGHT).error == TAKEN_OUT
     on_belt(physical, 0)
     write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(0, 2, is_gone=True))
     testing.run_once(perception, cell)
-    assert read(cell, words.CONVEYOR, words.SIGHT).error == ""
-    assert len(each(cell, "online", words.PACKAGES, words.SIGHTING)) == 1
+    assert get(cell.world("online"), words.CONVEYOR, words.SIGHT).error == ""
+    assert len(each(cell.world("online"), words.PACKAGES, words.SIGHTING)) == 1
 
 
 def test_an_empty_belt_that_could_not_be_seen_is_looked_at_again(physical, monkeypatch):

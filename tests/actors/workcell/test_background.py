@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from slots import put_online as put
 
 from actors.geometry.arms.kinematics import capsules_at
 from actors.geometry.capsules import fill, outlines
@@ -27,7 +28,7 @@ from actors.workcell.vocabulary import (
     Joints,
     camera_entity,
 )
-from enact_dist import Lock, View, Write, testing
+from enact_dist import Lock, View, testing
 
 cv2 = pytest.importorskip("cv2", exc_type=ImportError)
 
@@ -57,13 +58,6 @@ def image_of(random, *, person=False, shape=SHAPE):
     if person:
         image[PERSON] = (160, 60, 40)
     return np.rint(image + random.normal(0, 2.5, shape)).clip(0, 255).astype(np.uint8)
-
-
-def put(cell, entity, aspect, datum, stamp_ns=0):
-    """Write a datum."""
-    request = Write(cell.world("online"), entity, aspect)
-    with Lock(request) as lock:
-        lock.put(request, datum, stamp_ns=stamp_ns)
 
 
 def seen(cell, entity, aspect):

@@ -4,6 +4,7 @@ import time
 
 import numpy as np
 import pytest
+from slots import get, put
 
 from actors.geometry.arms.clearance import CellGrid
 from actors.geometry.arms.joint_paths import JointPath
@@ -88,29 +89,20 @@ class Cell:
         self.online.init(obstacle_entity(0), BOXES, TABLE[None])
         self.online.init(ROBOT, TASK, Task(np.array(goals), np.full(len(goals), dwell_s), cyclic))
 
-    def put(self, entity, aspect, value, stamp_ns=0):
-        request = Write(self.online, entity, aspect)
-        with Lock(request) as lock:
-            lock.put(request, value, stamp_ns=stamp_ns)
-
-    def get(self, entity, aspect):
-        request = View(self.online, entity, aspect)
-        return self.online.view(request).get(request)
-
     def see(self, q, voxels=NOBODY, dq=None):
         """Let one set come while the arm is at `q`; return the path."""
         self.now_ns += PERIOD_NS
         dq = np.zeros(7) if dq is None else dq
         stamps = self.now_ns - 10_000_000 * np.arange(29, -1, -1)
-        self.put(ROBOT, JOINTS, Joints(np.tile(q, (30, 1)), np.tile(dq, (30, 1)), stamps))
+        put(self.online, ROBOT, JOINTS, Joints(np.tile(q, (30, 1)), np.tile(dq, (30, 1)), stamps))
         count = len(voxels)
         hull = Hull(
             np.asarray(voxels, np.int16), np.zeros(count, np.float32), np.ones(count, bool),
             np.zeros(count, np.int16), {}, (), np.inf, -1,
         )  # fmt: skip
-        self.put(WORKSPACE, HULL, hull, self.now_ns)
+        put(self.online, WORKSPACE, HULL, hull, self.now_ns)
         testing.run_once(self.actor, self.cell)
-        return self.get(ROBOT, PATH)
+        return get(self.online, ROBOT, PATH)
 
 
 @pytest.fixture
@@ -245,7 +237,7 @@ def test_refused_path_is_planned_again_from_the_path_that_is_followed(worlds):
     beyond = late.waypoints[0] + 0.05 * ahead
     why = f"path {late.number} is refused: the arm has passed the place"
     done = Execution("moving", 1.0, 1.0, 0, 0, old.number, 0, 0, "", late.identity, why)
-    cell.put(ROBOT, EXECUTION, done)
+    put(cell.online, ROBOT, EXECUTION, done)
 
     new = cell.see(beyond, REACHING, 0.4 * ahead)
 
@@ -285,7 +277,7 @@ def test_refused_path_is_planned_again_from_where_the_arm_rests(worlds):
     path = cell.see(LEFT)
     beside = LEFT + 0.3 * heading_to(LEFT, RIGHT) + 0.01
     done = Execution("waiting", 0.0, 0.0, 0, 0, -1, 0, 0, "", path.identity, "path 2 is refused")
-    cell.put(ROBOT, EXECUTION, done)
+    put(cell.online, ROBOT, EXECUTION, done)
 
     new = cell.see(beside)
 
@@ -311,7 +303,7 @@ def run_past(cell, voxels, seconds=8.0):
         states.append((motion.q_rad, float(np.linalg.norm(motion.dq_rad_s))))
         refusals.add(motion.path_refusal)
         if at_ms % period == 0:
-            cell.put(ROBOT, EXECUTION, motion.execution(now_ns, now_ns, ""))
+            put(cell.online, ROBOT, EXECUTION, motion.execution(now_ns, now_ns, ""))
         if motion.doing.goals_reached == 2:
             break
     return states, refusals - {""}
@@ -324,7 +316,7 @@ def test_arm_goes_around_what_appears_while_it_moves(worlds):
 
     states, refusals = run_past(cell, REACHING)
 
-    path = cell.get(ROBOT, PATH)
+    path = get(cell.online, ROBOT, PATH)
     under_way = [speed for q, speed in states if -0.9 < q[0] < 0.8]
     points = ORIGIN_M + (REACHING + 0.5) * VOXEL_M
     off_m = [
@@ -377,7 +369,7 @@ def test_prediction_is_avoided_but_never_stops(worlds):
     at_s = np.linspace(0.1, 1.0, 10)
     middle = capsules_at(ARM, (LEFT + RIGHT) / 2)[0, -1, 3:5]
     walls = Prediction(at_s, np.tile(middle, (10, 1)), np.full(10, 0.15))
-    cell.put(human_entity(0), PREDICTION, walls)
+    put(cell.online, human_entity(0), PREDICTION, walls)
 
     for _ in range(6):
         kept = cell.see(LEFT + (RIGHT - LEFT) * 0.25)
@@ -395,7 +387,7 @@ def test_changed_task_is_planned_for(worlds):
     cell = Cell(worlds)
     cell.see(START)
     cell.see(LEFT)
-    cell.put(ROBOT, TASK, Task(np.array([LEFT, FURTHER]), np.zeros(2), cyclic=True))
+    put(cell.online, ROBOT, TASK, Task(np.array([LEFT, FURTHER]), np.zeros(2), cyclic=True))
 
     path = cell.see(LEFT + 0.01)
 
@@ -416,11 +408,11 @@ def test_both_in_one_actor(worlds):
     """As in the paper's Figure 4: path and speed by one actor, from one set."""
     cell = Cell(worlds, PlanningWithSpeed())
     cell.now_ns -= 10 * PERIOD_NS
-    cell.put(SYSTEM, CAMERA_STATES, {}, cell.now_ns + PERIOD_NS)
+    put(cell.online, SYSTEM, CAMERA_STATES, {}, cell.now_ns + PERIOD_NS)
     cell.see(START)
 
     path = cell.see(START)
 
     assert len(path.waypoints) == 2
-    assert cell.get(ROBOT, SPEED).captured_ns == cell.now_ns
-    assert cell.get(SYSTEM, SAFETY).state in {"run", "stop"}
+    assert get(cell.online, ROBOT, SPEED).captured_ns == cell.now_ns
+    assert get(cell.online, SYSTEM, SAFETY).state in {"run", "stop"}

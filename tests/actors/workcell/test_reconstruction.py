@@ -8,6 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from slots import put_online as put
 
 from actors.geometry.arms.kinematics import capsules_at
 from actors.geometry.capsules import distance_between, distance_to_points, fill, outlines
@@ -74,13 +75,6 @@ def joints_until(stamp_ns, samples=30, turning=0.0):
     dq = np.zeros((samples, 7))
     dq[:, 0] = turning
     return Joints(q, dq, stamps)
-
-
-def put(cell, entity, aspect, datum, stamp_ns=0):
-    """Write a datum."""
-    request = Write(cell.world("online"), entity, aspect)
-    with Lock(request) as lock:
-        lock.put(request, datum, stamp_ns=stamp_ns)
 
 
 def seen(cell, aspect=HULL):

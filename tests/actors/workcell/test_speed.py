@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from slots import datum_of, put
 
 from actors.geometry.arms.kinematics import capsules_at
 from actors.geometry.capsules import bounds
@@ -31,7 +32,7 @@ from actors.workcell.vocabulary import (
     Joints,
     Path,
 )
-from enact_dist import Lock, View, Write, testing
+from enact_dist import Lock, Write, testing
 
 MS = 1_000_000
 SEPARATION = Separation()
@@ -96,32 +97,23 @@ class Cell:
     def __init__(self, cell):
         self.cell, self.online, self.actor = cell, cell.world("online"), SpeedControl()
         self.online.init(ROBOT, MODEL, ARM)
-        self.put(SYSTEM, CAMERA_STATES, {}, time.time_ns())
-
-    def put(self, entity, aspect, value, stamp_ns=0):
-        request = Write(self.online, entity, aspect)
-        with Lock(request) as lock:
-            lock.put(request, value, stamp_ns=stamp_ns)
-
-    def get(self, entity, aspect):
-        request = View(self.online, entity, aspect)
-        return self.online.view(request)[request]
+        put(self.online, SYSTEM, CAMERA_STATES, {}, time.time_ns())
 
     def joints(self, stamp_ns):
         q = np.tile(HOME_RAD, (30, 1))
         stamps = stamp_ns - 10 * MS * np.arange(29, -1, -1)
-        self.put(ROBOT, JOINTS, Joints(q, np.zeros((30, 7)), stamps.astype(np.int64)))
+        put(self.online, ROBOT, JOINTS, Joints(q, np.zeros((30, 7)), stamps.astype(np.int64)))
 
     def path(self, *waypoints, number=1, reason=""):
         rows = np.array(waypoints, float).reshape(-1, 7)
-        self.put(ROBOT, PATH, Path(rows, number, 0, 1, 0, 0.0, reason))
+        put(self.online, ROBOT, PATH, Path(rows, number, 0, 1, 0, 0.0, reason))
 
     def judge(self, nearest_m, age_ms=50):
         """Put a hull and run the actor; return the speed."""
         captured_ns = time.time_ns() - age_ms * MS
-        self.put(WORKSPACE, HULL, hull(nearest_m), captured_ns)
+        put(self.online, WORKSPACE, HULL, hull(nearest_m), captured_ns)
         assert testing.run_once(self.actor, self.cell) == 1
-        speed = self.get(ROBOT, SPEED)
+        speed = datum_of(self.online, ROBOT, SPEED)
         assert speed.captured_ns == captured_ns
         return speed
 
@@ -152,7 +144,7 @@ def test_speed_carries_what_it_rests_on(cell):
     expected = Separation(reaction_s=0.25 + ROBOT_S).speed_max_m_s(0.8)
     assert speed.limit_m_s == pytest.approx(expected)
     assert 0.0 < speed.scale < 1.0
-    assert cell.get(SYSTEM, SAFETY).state == "slow"
+    assert datum_of(cell.online, SYSTEM, SAFETY).state == "slow"
 
 
 def test_share_is_that_of_the_speed_on_the_path(cell):
@@ -184,20 +176,20 @@ def test_reaction_time_is_measured(cell):
     assert quick.limit_m_s > first.limit_m_s
     assert late.valid_ms == 250.0
     assert late.limit_m_s == 0.0
-    assert cell.get(SYSTEM, SAFETY).reason == "the images come late"
+    assert datum_of(cell.online, SYSTEM, SAFETY).reason == "the images come late"
 
 
 def test_silent_robot_and_missing_path_are_said(cell):
     """Without joints there is a fault; without a path a stop with the planner's reason."""
     fault = cell.judge(math.inf)
-    state_before = cell.get(SYSTEM, SAFETY)
+    state_before = datum_of(cell.online, SYSTEM, SAFETY)
     cell.joints(time.time_ns())
     cell.path(number=3, reason="the goal is where something is in the way")
 
     cell.judge(math.inf)
 
     assert (fault.limit_m_s, state_before.state) == (0.0, "fault")
-    state = cell.get(SYSTEM, SAFETY)
+    state = datum_of(cell.online, SYSTEM, SAFETY)
     assert (state.state, state.reason) == (
         "stop",
         "no path: the goal is where something is in the way",
@@ -214,12 +206,12 @@ def test_a_silent_camera_watch_is_a_fault(cell, age_ms):
         with Lock(request := Write(cell.online, SYSTEM, CAMERA_STATES)) as lock:
             del lock[request]
     else:
-        cell.put(SYSTEM, CAMERA_STATES, {}, time.time_ns() - age_ms * MS)
+        put(cell.online, SYSTEM, CAMERA_STATES, {}, time.time_ns() - age_ms * MS)
 
     fault = cell.judge(2.0)
 
     assert sound.limit_m_s > 0.0 == fault.limit_m_s
-    state = cell.get(SYSTEM, SAFETY)
+    state = datum_of(cell.online, SYSTEM, SAFETY)
     assert (state.state, state.reason) == ("fault", "the camera watch is silent")
 
 
@@ -230,17 +222,17 @@ def test_cameras_are_named(cell):
     states = {
         f"camera/{n}": CameraState(n != 3, 0, 0, "silent" if n == 3 else "") for n in range(8)
     }
-    cell.put(SYSTEM, CAMERA_STATES, states, time.time_ns())
+    put(cell.online, SYSTEM, CAMERA_STATES, states, time.time_ns())
     without = cell.judge(2.0)
     misfit = CameraState(alive=True, last_ns=0, sets_missed=0, trouble="background no longer fits")
     misfits = {**states, **{f"camera/{n}": misfit for n in range(3)}}
-    cell.put(SYSTEM, CAMERA_STATES, misfits, time.time_ns())
+    put(cell.online, SYSTEM, CAMERA_STATES, misfits, time.time_ns())
 
     fault = cell.judge(2.0)
 
     assert without.reason == "2.00 m to the robot; without camera/3"
     assert fault.limit_m_s == 0.0
-    assert cell.get(SYSTEM, SAFETY).state == "fault"
+    assert datum_of(cell.online, SYSTEM, SAFETY).state == "fault"
 
 
 def test_no_distance_counts_on_more_braking_than_there_is(cell):
@@ -254,10 +246,10 @@ def test_no_distance_counts_on_more_braking_than_there_is(cell):
 def test_speeds_along_a_path_are_those_of_its_own_life_of_the_shard(cell):
     """Another path may have the number of one that went with the shard."""
     cell.joints(time.time_ns())
-    cell.put(ROBOT, PATH, Path(np.array([HOME_RAD, AWAY]), 1, 0, 1, 1000, 0.0))
+    put(cell.online, ROBOT, PATH, Path(np.array([HOME_RAD, AWAY]), 1, 0, 1, 1000, 0.0))
     quick = cell.judge(0.8)
     wrist = np.array(HOME_RAD) + np.array([0, 0, 0, 0, 0, 0, 2.0])
-    cell.put(ROBOT, PATH, Path(np.array([HOME_RAD, wrist]), 1, 0, 1, 2000, 0.0))
+    put(cell.online, ROBOT, PATH, Path(np.array([HOME_RAD, wrist]), 1, 0, 1, 2000, 0.0))
 
     slow = cell.judge(0.8)
 
@@ -271,7 +263,7 @@ def test_open_sides_keep_the_robot_from_who_stands_beside_the_volume(cell):
     fenced = cell.judge(math.inf)
     cell.actor.open_sides = True
     unknown = cell.judge(math.inf)
-    cell.put(WORKSPACE, GRID, Grid(np.array([-1.3, -1.2, 0.0]), 0.1, (28, 24, 20)))
+    put(cell.online, WORKSPACE, GRID, Grid(np.array([-1.3, -1.2, 0.0]), 0.1, (28, 24, 20)))
 
     beside = cell.judge(math.inf)
 
@@ -290,9 +282,9 @@ def test_safety_is_written_when_it_changes(cell):
     cell.path(HOME_RAD, AWAY)
     first = cell.judge(0.8)
     cell.judge(0.75)
-    since = cell.get(SYSTEM, SAFETY)
+    since = datum_of(cell.online, SYSTEM, SAFETY)
     last = cell.judge(0.2)
 
     assert (since.state, since.since_ns) == ("slow", first.captured_ns)
-    assert cell.get(SYSTEM, SAFETY).since_ns == last.captured_ns
+    assert datum_of(cell.online, SYSTEM, SAFETY).since_ns == last.captured_ns
     assert len(cell.online.history(SYSTEM, SAFETY)) == 2
