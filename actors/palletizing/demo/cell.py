@@ -15,12 +15,7 @@ _EYE: Final = "online-perception"
 
 
 class PalletizingCell(DemoCell):
-    """A palletizing cell that others run.
-
-    Attributes:
-        packages: How many packages come.
-        seed: Seed of all simulated sensors.
-    """
+    """A palletizing cell that others run."""
 
     def __init__(self, config: Path, *, packages: int, seed: int) -> None:
         super().__init__(config, log="the logs of its processes")

@@ -25,7 +25,6 @@ import time
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from actors.geometry.files import write_whole
 from actors.palletizing.control.controller import ControllerError
 from actors.palletizing.demo.lineage import show_packing
 from actors.palletizing.demo.packing_files import Seen, files_of
@@ -37,7 +36,7 @@ from actors.palletizing.demo.packing_report import (
     table_of,
 )
 from actors.palletizing.demo.robot_cell import RunningRobotCell, watched_robot_cell
-from actors.palletizing.demo.run import WATCHING, show_run, show_score, watch_demo
+from actors.palletizing.demo.run import WATCHING, show_run, show_score, watch_demo, write_pictures
 from actors.palletizing.operator import SCRIPT
 from actors.palletizing.vocabulary import (
     CONTROL,
@@ -146,7 +145,7 @@ def _show(running: RobotCell | RunningRobotCell, out: Path, cell: Cell, console:
     show_packing(cell, console)
     contents, left_out = files_of(cell, running.config, out, seen)
     contents[out / "report.json"] = report_bytes(rows, seen.figures)
-    _write(out, contents)
+    write_pictures(out, contents)
     for line in left_out:
         console.print(line)
 
@@ -292,11 +291,3 @@ def _told(seen: Seen) -> str:
     period = seen.figures.get("period_p99_ms")
     control = "" if period is None else f"; control period p99 {period:.1f} ms"
     return f"{count} packages in {seconds:.0f} s, {seconds / max(count, 1):.1f} s each{control}"
-
-
-def _write(out: Path, contents: dict[Path, bytes]) -> None:
-    """Write all files, none half, and remove those of an earlier run."""
-    old = ("tray_[0-9]*.png", "model_*.png", "deviation_*.png", "net_*.svg", "cell.png")
-    for stale in {path for pattern in old for path in out.glob(pattern)} - contents.keys():
-        stale.unlink()
-    write_whole(contents)

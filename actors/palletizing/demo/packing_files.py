@@ -7,23 +7,15 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from actors.geometry.pictures.picture import png_bytes
-from actors.palletizing.demo.pictures import tray_picture
-from actors.palletizing.demo.run import model_pictures
+from actors.palletizing.demo.run import pictures_of
 from actors.palletizing.handling.net_picture import svg_of_net
 from actors.palletizing.handling.stages import STANDS
 from actors.palletizing.vocabulary import (
-    EMPTY,
     EXECUTION,
     NET,
-    OBSERVATION,
-    PLACES,
-    PLAN,
-    REGION,
     ROBOT,
     SYSTEM,
-    TRAY,
 )
-from enact_dist import View, ViewEach
 from enact_dist.actor.check import declarations_of
 from enact_dist.actor.graph import graph_of, svg_of
 from enact_dist.config.read import load_config
@@ -54,7 +46,6 @@ class Seen:
         pictures: The cell, drawn by MuJoCo, by name of the file.
         undrawn: Why it could not be drawn.
         started_s: When the first package had come; 0: it has not.
-        started_sim_ns: The same in simulated time.
         figures: What was measured.
     """
 
@@ -78,9 +69,9 @@ def files_of(
         out: Folder of the files.
         seen: What was seen while the run went on.
     """
-    contents = model_pictures(cell, out)
-    for tray, picture in _trays(cell, seen).items():
-        contents[out / f"tray_{tray + 1}.png"] = png_bytes(picture)
+    standing = {place for place, result in seen.results.items() if result.result in STANDS}
+    flags = {place: flag for place, flag in seen.flags.items() if place in standing}
+    contents = pictures_of(cell, out, flags)
     for name, picture in seen.pictures.items():
         contents[out / name] = png_bytes(picture)
     for stage, text in _nets(cell).items():
@@ -89,33 +80,6 @@ def files_of(
     contents[out / "actors.svg"] = svg_of(graph_of(actors), f"cell {cell.name}").encode()
     left_out = [f"no picture of the cell: {seen.undrawn}"] if seen.undrawn else []
     return contents, left_out
-
-
-def _trays(cell: Cell, seen: Seen) -> dict[int, Picture]:
-    """Return the newest picture of each tray, by its number."""
-    training, online = cell.world("training"), cell.world("online")
-    plans, empty = ViewEach(training, PLACES, PLAN), View(training, TRAY, EMPTY)
-    looks, regions = ViewEach(online, PLACES, OBSERVATION), ViewEach(online, PLACES, REGION)
-    reference, observed = training.view(plans, empty), online.view(looks, regions)
-    newest: dict[int, tuple[int, object]] = {}
-    frames = {}
-    for place, look in observed[looks].items():
-        tray = reference[plans][place].tray
-        if tray not in newest or look.captured_ns > newest[tray][0]:
-            newest[tray] = look.captured_ns, place
-            frames[tray] = look.frame
-    pictures = {}
-    for tray, frame in frames.items():
-        deviating = [
-            (place.name, seen.flags[place.name], region)
-            for place, region in observed[regions].items()
-            if reference[plans][place].tray == tray
-            and place.name in seen.flags
-            and seen.flags[place.name].verdict != "ok"
-            and seen.results[place.name].result in STANDS
-        ]
-        pictures[tray] = tray_picture(frame, reference[empty].depth_mm, deviating)
-    return pictures
 
 
 def _nets(cell: Cell) -> dict[str, str]:

@@ -54,12 +54,7 @@ class Row:
 
 
 def judged_by(package: PackageTruth, plan: Plan) -> tuple[str, str]:
-    """Return what became of a package in the words of the verdicts, and in numbers.
-
-    Args:
-        package: The truth.
-        plan: Where it was to stand.
-    """
+    """Return what became of a package in the words of the verdicts, and in numbers."""
     planned = plan.tray_from_product
     return seen_as(package, planned), in_words(package, planned)
 

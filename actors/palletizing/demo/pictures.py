@@ -15,11 +15,11 @@ from actors.geometry.surfaces.depth import mean_known, median_known, metres, poi
 from actors.geometry.surfaces.depth_reconstruction import grid_triangles
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     import numpy.typing as npt
 
-    from actors.geometry.shapes import Acquisition, Camera, DepthFrame, Surface
+    from actors.geometry.shapes import Camera, DepthFrame, Surface
     from actors.palletizing.vocabulary import Deviation
 
     Picture = npt.NDArray[np.uint8]
@@ -42,6 +42,7 @@ FACES: Final = (
 )
 """One colour per planar patch, in turn; free form is clay."""
 
+TRAY_PX: Final = (1080, 780)
 LABEL_PX: Final = 17
 """Height of a capital letter of a verdict; its plate is less than twice as high."""
 OVER_M: Final = 0.25
@@ -87,8 +88,6 @@ def tray_picture(
     frame: DepthFrame,
     empty_mm: npt.NDArray[np.uint16],
     regions: Sequence[tuple[str, Deviation, Mask]],
-    *,
-    size_px: tuple[int, int] = (1080, 780),
 ) -> Picture:
     """Show a tray as the sensor saw it, with the deviating regions in red, each under its verdict.
 
@@ -96,7 +95,6 @@ def tray_picture(
         frame: The last image of the tray; its world is the tray frame.
         empty_mm: (H, W) uint16, the empty tray, millimetres.
         regions: Name of the place, its flag and its region (H, W) bool, for each deviating place.
-        size_px: Width and height of the picture.
     """
     camera, pose = frame.acquisition.camera, frame.acquisition.world_from_camera
     depth_m = mean_known(median_known(metres(frame.depth_mm), 5), 3)
@@ -112,12 +110,13 @@ def tray_picture(
         np.array([[x, y, z] for x in (-0.46, 0.46) for y in (-0.33, 0.33) for z in (0.0, 0.08)]),
         azimuth_deg=-90.0,
         elevation_deg=52.0,
-        size_px=size_px,
+        size_px=TRAY_PX,
     )
     picture = draw_bodies(_bodies(points_grid(depth_m, camera), points, colours, camera), view)
     for place, flag, region in regions:
-        seen = _pixels(points[region.ravel()], view)
-        column, top = np.nanmean(seen[:, 0]), np.nanmin(seen[:, 1])
+        seen = moved(points[region.ravel()], inverse(view.world_from_camera))
+        columns, rows = view.camera.column_row(*seen.T)
+        column, top = np.nanmean(columns), np.nanmin(rows)
         at = round(float(column)) - 80, round(float(top)) - 2 * LABEL_PX
         amount = f" {flag.deviation_mm:.0f} mm" if flag.verdict != "missing" else ""
         picture = with_label(picture, f"{place}: {flag.verdict}{amount}", at, height_px=LABEL_PX)
@@ -139,26 +138,3 @@ def _bodies(
         tone = tint[used] if tint.ndim == 2 else tint
         bodies.append(Body(points_m[used], renumbered.reshape(-1, 3), tone))
     return bodies
-
-
-def latest(frames: Mapping[int, DepthFrame], trays: Mapping[int, int]) -> dict[int, DepthFrame]:
-    """Return the last frame of each tray.
-
-    Args:
-        frames: By stop.
-        trays: Tray of each stop.
-    """
-    return {trays[stop]: frames[stop] for stop in sorted(frames)}
-
-
-def _pixels(points_m: npt.NDArray[np.float64], view: Acquisition) -> npt.NDArray[np.float64]:
-    """Return column and row of points of the world in a picture, NaN where a point has NaN."""
-    local = moved(points_m, inverse(view.world_from_camera))
-    camera = view.camera
-    return np.stack(
-        [
-            camera.fx_px * local[:, 0] / local[:, 2] + camera.cx_px,
-            camera.fy_px * local[:, 1] / local[:, 2] + camera.cy_px,
-        ],
-        axis=1,
-    )

@@ -182,9 +182,6 @@ def configured(
 def watched_robot_cell(config: Path) -> RobotCell | None:
     """Return a cell with a simulated robot that runs already; None if it is none.
 
-    Args:
-        config: Its `cell.toml`.
-
     Raises:
         ConfigError: The file cannot be used, or its hardware is not simulated.
     """

@@ -26,7 +26,7 @@ from actors.geometry.pictures.picture import png_bytes
 from actors.palletizing.control.controller import ControllerError
 from actors.palletizing.demo.cell import watched_cell
 from actors.palletizing.demo.lineage import show_lineage
-from actors.palletizing.demo.pictures import latest, model_picture, tray_picture
+from actors.palletizing.demo.pictures import model_picture, tray_picture
 from actors.palletizing.demo.report import difference_of, report_bytes, rows_of, score_of, table_of
 from actors.palletizing.simulation.packages import package_sequence
 from actors.palletizing.vocabulary import (
@@ -45,7 +45,6 @@ from actors.palletizing.vocabulary import (
     TRAY,
     USER,
     VIEWS,
-    place_entity,
 )
 from actors.running_cell import DemoError, until_interrupted
 from enact_dist import View, ViewEach
@@ -58,10 +57,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from actors.palletizing.demo.pictures import Picture
-    from actors.palletizing.demo.report import Row
     from actors.palletizing.simulation.packages import Package
-    from actors.palletizing.vocabulary import Notice
+    from actors.palletizing.vocabulary import Deviation, Notice
     from actors.running_cell import DemoCell
     from enact_dist import Cell
 
@@ -90,10 +87,12 @@ def watch_demo(config: Path, *, out: Path) -> int:
 
     def show(cell: Cell, console: Console) -> None:
         _follow(cell, demo, truths, console)
-        rows = _outcome(cell, truths)
+        flags, notices = _outcome(cell)
+        rows = rows_of(truths, flags, notices)
         show_score(cell, table_of(rows), score_of(rows), console)
         show_lineage(cell, rows[-1].product, console)
-        _write_files(cell, out, report_bytes(rows, seed=demo.seed))
+        contents = {out / "report.json": report_bytes(rows, seed=demo.seed)}
+        write_pictures(out, contents | pictures_of(cell, out, flags))
 
     return show_run(demo, out, WATCHING, show)
 
@@ -141,18 +140,34 @@ def show_score(cell: Cell, table: Table, score: str, console: Console) -> None:
     console.print("", difference_of(planned), "", sep="\n")
 
 
-def model_pictures(cell: Cell, out: Path) -> dict[Path, bytes]:
-    """Return the picture of each trained surface by its file."""
-    training = cell.world("training")
-    surfaces = ViewEach(training, PRODUCTS, SURFACE)
-    trained = {
-        product.name.removeprefix("product/"): surface
-        for product, surface in training.view(surfaces)[surfaces].items()
-    }
-    return {
-        out / f"model_{name}.png": png_bytes(model_picture(name, surface))
-        for name, surface in trained.items()
-    }
+def pictures_of(cell: Cell, out: Path, flags: Mapping[str, Deviation]) -> dict[Path, bytes]:
+    """Return the pictures of the trained surfaces, and of the newest look at each tray, by file.
+
+    Args:
+        cell: The cell.
+        out: Folder of the files.
+        flags: Verdicts by name of the place; what deviates is marked on its tray.
+    """
+    training, online = cell.world("training"), cell.world("online")
+    surfaces, plans = ViewEach(training, PRODUCTS, SURFACE), ViewEach(training, PLACES, PLAN)
+    empty = View(training, TRAY, EMPTY)
+    looks, regions = ViewEach(online, PLACES, OBSERVATION), ViewEach(online, PLACES, REGION)
+    reference, seen = training.view(surfaces, plans, empty), online.view(looks, regions)
+    pictures = {}
+    for product, surface in reference[surfaces].items():
+        name = product.name.removeprefix("product/")
+        pictures[out / f"model_{name}.png"] = model_picture(name, surface)
+    trays = {place: plan.tray for place, plan in reference[plans].items()}
+    by_time = sorted(seen[looks].items(), key=lambda look: look[1].captured_ns)
+    for tray, frame in {trays[place]: look.frame for place, look in by_time}.items():
+        deviating = [
+            (place.name, flags[place.name], region)
+            for place, region in seen[regions].items()
+            if trays[place] == tray and place.name in flags and flags[place.name].verdict != "ok"
+        ]
+        picture = tray_picture(frame, reference[empty].depth_mm, deviating)
+        pictures[out / f"tray_{tray + 1}.png"] = picture
+    return {file: png_bytes(picture) for file, picture in pictures.items()}
 
 
 def _follow(cell: Cell, running: DemoCell, truths: Sequence[Package], console: Console) -> None:
@@ -230,41 +245,17 @@ def _look(cell: Cell) -> _Seen:
     )
 
 
-def _outcome(cell: Cell, truths: Sequence[Package]) -> list[Row]:
-    """Read flags and notices, and set them beside the truth."""
+def _outcome(cell: Cell) -> tuple[Mapping[str, Deviation], Mapping[str, Notice]]:
+    """Return flags and notices, by place."""
     online = cell.world("online")
     flags, notices = View(online, SYSTEM, DEVIATIONS), View(online, USER, NOTICES)
     told = online.view(flags, notices)
-    return rows_of(truths, told[flags], told[notices])
+    return told[flags], told[notices]
 
 
-def _write_files(cell: Cell, out: Path, report: bytes) -> None:
-    """Draw the pictures; write all files, none half, and remove those of an earlier run."""
-    contents = {out / "report.json": report, **model_pictures(cell, out)}
-    for tray, picture in _tray_pictures(cell).items():
-        contents[out / f"tray_{tray + 1}.png"] = png_bytes(picture)
-    for stale in {*out.glob("tray_[0-9]*.png"), *out.glob("model_*.png")} - contents.keys():
+def write_pictures(out: Path, contents: dict[Path, bytes]) -> None:
+    """Write all files, none half, and remove the pictures of an earlier run."""
+    old = ("tray_[0-9]*.png", "model_*.png", "deviation_*.png", "net_*.svg", "cell.png")
+    for stale in {path for pattern in old for path in out.glob(pattern)} - contents.keys():
         stale.unlink()
     write_whole(contents)
-
-
-def _tray_pictures(cell: Cell) -> dict[int, Picture]:
-    """Return the picture of each tray, by its number."""
-    training, online = cell.world("training"), cell.world("online")
-    plans, empty = ViewEach(training, PLACES, PLAN), View(training, TRAY, EMPTY)
-    seen, regions = ViewEach(online, PLACES, OBSERVATION), ViewEach(online, PLACES, REGION)
-    judged = View(online, SYSTEM, DEVIATIONS)
-    reference, observed = training.view(plans, empty), online.view(seen, regions, judged)
-    flags = observed[judged]
-    stops = {stop: place_entity(stop) for stop in range(len(flags))}
-    trays = {stop: reference[plans][place].tray for stop, place in stops.items()}
-    frames = {stop: observed[seen][place].frame for stop, place in stops.items()}
-    pictures = {}
-    for tray, frame in latest(frames, trays).items():
-        deviating = [
-            (place.name, flags[place.name], observed[regions][place])
-            for stop, place in stops.items()
-            if trays[stop] == tray and flags[place.name].verdict != "ok"
-        ]
-        pictures[tray] = tray_picture(frame, reference[empty].depth_mm, deviating)
-    return pictures
