@@ -204,11 +204,12 @@ class BeltController(Protocol):
         ...
 
 
-def open_controller(address: str) -> Any:  # the caller knows which protocol it asked for
-    """Return the controller at an address, not yet started.
+def open_controller(address: str, kind: str = "controller") -> Any:
+    """Return the controller at an address, not yet started; the caller knows its protocol.
 
     Args:
         address: ``MODULE:FUNCTION?name=value&name=value``; the function gets the values as text.
+        kind: What it is, for the errors: a sensor is opened likewise.
 
     Raises:
         ValueError: The text is malformed, or the function does not exist or refuses the values.
@@ -216,12 +217,12 @@ def open_controller(address: str) -> Any:  # the caller knows which protocol it 
     path, _, query = address.partition("?")
     module_name, colon, function_name = path.partition(":")
     if not colon:
-        raise ValueError(f"{address!r} is no controller; write MODULE:FUNCTION?name=value")
+        raise ValueError(f"{address!r} is no {kind}; write MODULE:FUNCTION?name=value")
     try:
         make = getattr(importlib.import_module(module_name), function_name)
     except (ImportError, AttributeError) as error:
-        raise ValueError(f"no controller at {address!r}: {error}") from error
+        raise ValueError(f"no {kind} at {address!r}: {error}") from error
     try:
         return make(**dict(parse_qsl(query, strict_parsing=bool(query))))
     except TypeError as error:
-        raise ValueError(f"the controller {address!r} refuses its values: {error}") from error
+        raise ValueError(f"the {kind} {address!r} refuses its values: {error}") from error

@@ -6,13 +6,12 @@ rectified, with the intrinsic parameters and the calibrated (or, eye in hand, th
 
 from __future__ import annotations
 
-import importlib
 from typing import TYPE_CHECKING, Any, Final, Protocol
-from urllib.parse import parse_qsl
 
 import numpy as np
 
 from actors.geometry.surfaces.depth import fused
+from actors.palletizing.control.controller import open_controller
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -122,21 +121,6 @@ class OrbitSensor(Protocol):
         ...
 
 
-def open_sensor(address: str) -> Any:  # the caller knows which of the two protocols it asked for
-    """Return the sensor at an address.
-
-    Args:
-        address: ``MODULE:FUNCTION?name=value&name=value``; the function gets the values as text.
-
-    Raises:
-        ValueError: The text is malformed, or the function does not exist.
-    """
-    path, _, query = address.partition("?")
-    module_name, colon, function_name = path.partition(":")
-    if not colon:
-        raise ValueError(f"{address!r} is no sensor; write MODULE:FUNCTION?name=value")
-    try:
-        make = getattr(importlib.import_module(module_name), function_name)
-    except (ImportError, AttributeError) as error:
-        raise ValueError(f"no sensor at {address!r}: {error}") from error
-    return make(**dict(parse_qsl(query, strict_parsing=bool(query))))
+def open_sensor(address: str) -> Any:
+    """Return the sensor at an address, as `open_controller` does; the caller knows its protocol."""
+    return open_controller(address, "sensor")
