@@ -52,6 +52,7 @@ def test_shard_agrees_with_a_list_of_dicts_about_the_past():
     assert run_and_meet(ShardHistoryMachine, EXAMPLES, STEPS, MET) == []
 
 
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize("mutant", history_mutants.ALL, ids=lambda mutant: mutant.__name__)
 def test_machine_bites(mutant, monkeypatch):
     """With the shard's own assertions off, a small wrong edit is noticed within some examples."""

@@ -101,6 +101,7 @@ MUTANTS = (
 )
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("mutant", MUTANTS, ids=lambda mutant: mutant.__name__)
 def test_machine_bites(mutant, monkeypatch):
     """With the table's own assertions off, a small wrong edit is noticed within some examples."""

@@ -44,6 +44,7 @@ def test_shard_agrees_with_the_definition_step_by_step():
         assert coverage.tally[kind] > 0
 
 
+@pytest.mark.sampled(10)
 @pytest.mark.parametrize("mutant", machine_mutants.ALL, ids=lambda mutant: mutant.__name__)
 def test_machine_bites(mutant, monkeypatch):
     """With the shard's own assertions off, a small wrong edit is noticed within some examples."""

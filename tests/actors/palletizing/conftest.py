@@ -1,6 +1,8 @@
 """Products trained once per test run, and a simulated tray."""
 
+import fcntl
 import os
+import pickle
 from functools import lru_cache
 
 import pytest
@@ -9,13 +11,30 @@ os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo chooses what draws when it i
 
 
 @pytest.fixture(scope="session")
-def trained():
-    """Return a function from a product's name to the surface that 14 views of it give, of four images each."""
+def trained(tmp_path_factory):
+    """Return a function from a product's name to the surface that 14 views of it give, of four images each.
+
+    It is trained once for all processes of a run, which share a folder.
+    """
     pytest.importorskip("open3d", exc_type=ImportError)
     from actors.palletizing.simulation.sensors import SimulatedOrbitSensor
     from actors.palletizing.trials.evaluation import train
 
-    return lru_cache(lambda product: train(product, SimulatedOrbitSensor(seed=5), frames=4))
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent
+
+    @lru_cache
+    def surface_of(product):
+        with (folder / f"{product}.pickle").open("a+b") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            if not file.tell():  # nobody before has trained it
+                pickle.dump(train(product, SimulatedOrbitSensor(seed=5), frames=4), file)
+                file.flush()
+            file.seek(0)
+            return pickle.load(file)
+
+    return surface_of
 
 
 @pytest.fixture(scope="session")
@@ -30,10 +49,10 @@ def tray():
 
 
 @pytest.fixture
-def cell(trained):
-    """A cell with two trained products, grasps, and a plan of four packages."""
+def cell():
+    """A cell with two products, grasps, and a plan of four packages."""
     pytest.importorskip("mujoco", exc_type=ImportError)
     from .handled_cell import handled_cell
 
-    with handled_cell(trained) as opened:
+    with handled_cell() as opened:
         yield opened

@@ -1,9 +1,11 @@
-"""A cell in process with two trained products and a plan, and what actors would write into it."""
+"""A cell in process with two products and a plan, and what actors would write into it."""
 
 import contextlib
 
 import numpy as np
+import slots
 
+from actors.geometry.shapes import Surface
 from actors.palletizing import vocabulary as words
 from actors.palletizing.action import Action
 from actors.palletizing.action_generator import ActionGenerator
@@ -11,9 +13,10 @@ from actors.palletizing.feedback import HandlingFeedback
 from actors.palletizing.handling.nets import Execution
 from actors.palletizing.planning import RowPlanning
 from actors.palletizing.simulation.cell.scene import HOME_RAD
+from actors.palletizing.simulation.products import product_mesh
 from actors.palletizing.training_grasp import TrainingGrasp
 from actors.workcell.vocabulary import JOINTS, JOINTS_KEPT, Joints
-from enact_dist import Entity, Lock, View, ViewEach, Write, testing
+from enact_dist import Entity, testing
 
 REMOTE = "actors.palletizing.simulation.remote_cell"
 ARM = f"{REMOTE}:arm?port=1"
@@ -21,13 +24,18 @@ PACKAGE, PLACE = Entity("package/a"), Entity("place/0")
 NAMES = ("milk_carton", "meal_tray")
 
 
+def shape_of(product):
+    """Return the true shape of a product, for tests that look at no picture of it."""
+    return Surface.free_form(*product_mesh(product))
+
+
 @contextlib.contextmanager
-def handled_cell(trained):
-    """A cell with two trained products, grasps, and a plan of four packages."""
+def handled_cell():
+    """A cell with two products, grasps, and a plan of four packages."""
     with testing.worlds("training", "online") as cell:
         training = cell.world("training")
         for name in NAMES:
-            training.init(words.product_entity(name), words.SURFACE, trained(name))
+            training.init(words.product_entity(name), words.SURFACE, shape_of(name))
         planned(cell)
         testing.run_once(TrainingGrasp("milk_carton=0.5 meal_tray=0.35"), cell)
         still = np.tile(np.array(HOME_RAD), (JOINTS_KEPT, 1))
@@ -42,19 +50,15 @@ def planned(cell):
 
 
 def write(cell, entity, aspect, datum, world="online"):
-    request = Write(cell.world(world), entity, aspect)
-    with Lock(request) as lock:
-        lock[request] = datum
+    slots.put(cell.world(world), entity, aspect, datum)
 
 
 def read(cell, entity, aspect, world="online"):
-    request = View(cell.world(world), entity, aspect)
-    return cell.world(world).view(request).get(request)
+    return slots.get(cell.world(world), entity, aspect)
 
 
 def each(cell, pattern, aspect, world="training"):
-    request = ViewEach(cell.world(world), pattern, aspect)
-    return dict(cell.world(world).view(request)[request])
+    return slots.each(cell.world(world), pattern, aspect)
 
 
 def come(cell, *, product="milk_carton", number=0, package=PACKAGE):

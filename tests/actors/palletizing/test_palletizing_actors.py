@@ -7,6 +7,8 @@ import pytest
 
 pytest.importorskip("open3d", exc_type=ImportError)
 
+from slots import each, get, put_online
+
 from actors.palletizing.conveyor import Conveyor
 from actors.palletizing.deviation import DeviationDetection
 from actors.palletizing.feedback import Feedback
@@ -38,7 +40,9 @@ from actors.palletizing.vocabulary import (
     product_entity,
     view_entity,
 )
-from enact_dist import Lock, View, ViewEach, Write, testing
+from enact_dist import testing
+
+from .handled_cell import shape_of
 
 SENSORS = "actors.palletizing.simulation.sensors"
 PACKAGE_COUNT, SEED = 10, 83
@@ -58,22 +62,6 @@ def cell(trained):
         yield cell
 
 
-def online(cell, entity, aspect, default=None):
-    request = View(cell.world("online"), entity, aspect)
-    return cell.world("online").view(request).get(request, default)
-
-
-def each(cell, world, pattern, aspect):
-    request = ViewEach(cell.world(world), pattern, aspect)
-    return dict(cell.world(world).view(request)[request])
-
-
-def stand_at(cell, stop):
-    request = Write(cell.world("online"), CONVEYOR, STOP)
-    with Lock(request) as lock:
-        lock[request] = stop
-
-
 def test_cell_judges_a_sequence_of_packages(cell, capsys):
     """Every package of two trays gets the right flag, and the user reads a line for each."""
     actors = [Conveyor(), OnlinePerception(OVERHEAD), DeviationDetection(), Feedback()]
@@ -82,11 +70,11 @@ def test_cell_judges_a_sequence_of_packages(cell, capsys):
         testing.run_once(actor, cell)
 
     truths = [package.truth.kind for package in package_sequence(PACKAGE_COUNT, seed=SEED)]
-    flags = online(cell, SYSTEM, DEVIATIONS)
+    flags = get(cell.world("online"), SYSTEM, DEVIATIONS)
     verdicts = [flags[f"place/{stop}"].verdict for stop in range(PACKAGE_COUNT)]
     assert verdicts == [VERDICT_OF_KIND[kind] for kind in truths]
     assert len(capsys.readouterr().out.splitlines()) == PACKAGE_COUNT
-    assert len(online(cell, USER, NOTICES)) == PACKAGE_COUNT
+    assert len(get(cell.world("online"), USER, NOTICES)) == PACKAGE_COUNT
     for stop, kind in enumerate(truths):
         assert (flags[f"place/{stop}"].package == "") == (kind == "missing")
     diff = cell.world("training").diff(cell.world("online"), PLACES, [STANDING])
@@ -128,10 +116,10 @@ def test_training_makes_one_entity_per_view_and_one_surface_per_product():
         testing.run_once(Reconstruction(), cell)
         testing.run_once(fusion, cell)
 
-        clouds = each(cell, "training", VIEWS, CLOUD)
+        clouds = each(cell.world("training"), VIEWS, CLOUD)
         assert set(clouds) == {view_entity("yoghurt_cup", number) for number in range(6)}
-        assert set(each(cell, "training", VIEWS, SURFACE)) == set(clouds)
-        surface = each(cell, "training", PRODUCTS, SURFACE)[product_entity("yoghurt_cup")]
+        assert set(each(cell.world("training"), VIEWS, SURFACE)) == set(clouds)
+        surface = each(cell.world("training"), PRODUCTS, SURFACE)[product_entity("yoghurt_cup")]
         assert surface.vertices_m[:, 2].max() == pytest.approx(0.102, abs=0.003)
         assert testing.run_once(fusion, cell) == 0
 
@@ -144,7 +132,7 @@ def test_training_goes_on_after_a_crash():
         first = TrainingPerception(address, OVERHEAD)
         for _ in range(3):
             testing.run_once(first, cell)
-        before = each(cell, "training", VIEWS, CLOUD)
+        before = each(cell.world("training"), VIEWS, CLOUD)
 
         second = TrainingPerception(address, OVERHEAD)
         for _ in range(3):
@@ -169,30 +157,30 @@ def test_fusion_waits_for_the_last_view():
 
         testing.run_once(Fusion(), cell)
 
-        assert each(cell, "training", PRODUCTS, SURFACE) == {}
-        assert len(each(cell, "training", PRODUCTS, SCAN)) == 1
+        assert each(cell.world("training"), PRODUCTS, SURFACE) == {}
+        assert len(each(cell.world("training"), PRODUCTS, SCAN)) == 1
 
 
 def test_two_perceptions_make_one_entity_of_a_package(cell):
     """Both see the same new packages; the second finds the entities that the first has made."""
     for stop in range(2):
-        stand_at(cell, stop)
+        put_online(cell, CONVEYOR, STOP, stop)
         for _ in range(2):
             testing.run_once(OnlinePerception(OVERHEAD), cell)
 
     truths = [package.truth.kind for package in package_sequence(2, seed=SEED)]
     wanted = sum({"missing": 0, "extra": 2}.get(kind, 1) for kind in truths)
-    assert len(each(cell, "online", PACKAGES, SIGHTING)) == wanted > 0
+    assert len(each(cell.world("online"), PACKAGES, SIGHTING)) == wanted > 0
 
 
 def test_package_keeps_its_entity_from_stop_to_stop(cell):
     """A package that stays is seen again as itself; another tray has entities of its own."""
     perception = OnlinePerception(OVERHEAD)
     for stop in (0, 1, 2, 8):
-        stand_at(cell, stop)
+        put_online(cell, CONVEYOR, STOP, stop)
         testing.run_once(perception, cell)
 
-    sightings = each(cell, "online", PACKAGES, SIGHTING).values()
+    sightings = each(cell.world("online"), PACKAGES, SIGHTING).values()
 
     assert {
         (seen.tray, seen.first_stop, seen.last_stop) for seen in sightings if seen.first_stop == 0
@@ -200,19 +188,19 @@ def test_package_keeps_its_entity_from_stop_to_stop(cell):
     assert {seen.tray for seen in sightings if seen.first_stop == 8} == {1}
 
 
-def test_conveyor_waits_for_the_products(trained):
+def test_conveyor_waits_for_the_products():
     """Before every planned product is trained nothing comes."""
     with testing.worlds("training", "online") as cell:
         testing.run_once(Planning(4, " ".join(NAMES)), cell)
         conveyor = Conveyor()
-        cell.world("training").init(product_entity(NAMES[0]), SURFACE, trained(NAMES[0]))
+        cell.world("training").init(product_entity(NAMES[0]), SURFACE, shape_of(NAMES[0]))
         testing.run_once(conveyor, cell)
-        early = online(cell, CONVEYOR, STOP)
+        early = get(cell.world("online"), CONVEYOR, STOP)
 
-        cell.world("training").init(product_entity(NAMES[1]), SURFACE, trained(NAMES[1]))
+        cell.world("training").init(product_entity(NAMES[1]), SURFACE, shape_of(NAMES[1]))
         testing.run_once(conveyor, cell)
 
-        assert (early, online(cell, CONVEYOR, STOP)) == (None, 0)
+        assert (early, get(cell.world("online"), CONVEYOR, STOP)) == (None, 0)
 
 
 def test_conveyor_waits_for_the_verdict(cell):
@@ -220,13 +208,13 @@ def test_conveyor_waits_for_the_verdict(cell):
     perception, detection = OnlinePerception(OVERHEAD), DeviationDetection()
     for _ in range(3):
         testing.run_once(Conveyor(), cell)
-    waiting = online(cell, CONVEYOR, STOP)
+    waiting = get(cell.world("online"), CONVEYOR, STOP)
 
     testing.run_once(perception, cell)
     testing.run_once(detection, cell)
     testing.run_once(Conveyor(), cell)
 
-    assert (waiting, online(cell, CONVEYOR, STOP)) == (0, 1)
+    assert (waiting, get(cell.world("online"), CONVEYOR, STOP)) == (0, 1)
 
 
 def test_detection_gives_the_same_flags_after_a_restart(cell):
@@ -235,28 +223,28 @@ def test_detection_gives_the_same_flags_after_a_restart(cell):
     Lengths may differ by 0.2 mm: Open3D's registration adds up in parallel, in no fixed order.
     """
     for stop in range(2):
-        stand_at(cell, stop)
+        put_online(cell, CONVEYOR, STOP, stop)
         testing.run_once(OnlinePerception(OVERHEAD), cell)
         testing.run_once(DeviationDetection(), cell)
-    before = online(cell, SYSTEM, DEVIATIONS)
+    before = get(cell.world("online"), SYSTEM, DEVIATIONS)
 
     again = testing.run_once(DeviationDetection(), cell)
 
     assert again == 2
-    after = online(cell, SYSTEM, DEVIATIONS)
+    after = get(cell.world("online"), SYSTEM, DEVIATIONS)
     assert after.keys() == before.keys()
     for name, flag in before.items():
         same = ("package", "product", "verdict", "captured_ns")
         assert [getattr(after[name], f) for f in same] == [getattr(flag, f) for f in same]
         assert after[name].deviation_mm == pytest.approx(flag.deviation_mm, abs=0.2)
         assert after[name].shift_mm == pytest.approx(flag.shift_mm, abs=0.2)
-    regions = each(cell, "online", PLACES, REGION)
+    regions = each(cell.world("online"), PLACES, REGION)
     assert all(region.dtype == np.bool_ for region in regions.values())
 
 
 def test_feedback_tells_each_verdict_once(cell, capsys):
     """A second feedback finds in the context what the user knows already."""
-    stand_at(cell, 0)
+    put_online(cell, CONVEYOR, STOP, 0)
     testing.run_once(OnlinePerception(OVERHEAD), cell)
     testing.run_once(DeviationDetection(), cell)
 

@@ -48,7 +48,7 @@ def test_planning_makes_rows_and_closes_the_gap_of_a_rejected_package(cell):
     assert abs(after[second].tray_from_product[0, 3]) < abs(x[0])
 
 
-def test_scans_are_ordered_as_soon_as_the_tray_was_seen_empty(trained):
+def test_scans_are_ordered_as_soon_as_the_tray_was_seen_empty():
     """No product is trained yet; planning waits for what happens and looks at nothing else."""
     from actors.palletizing.simulation.physical_sensors import PhysicalTraySensor
     from actors.palletizing.simulation.physics import PhysicalCell
