@@ -24,9 +24,13 @@ from actors.palletizing.vocabulary import (
     Standing,
     product_entity,
 )
-from enact_dist import Actor, Entity, View, ViewEach, World, Write
+from enact_dist import Actor, View, ViewEach, World, Write
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from actors.geometry.recognition.deviation import Finding
+    from actors.palletizing.vocabulary import Observation, Sighting
     from enact_dist import Lock
 
 
@@ -70,32 +74,38 @@ class DeviationDetection(Actor):
         """Judge one place."""
         plan, observed = lock[self.plan], lock[self.observed]
         model = lock[self.models][product_entity(plan.product)]
-        sightings = lock[self.sightings]
+        sightings = {package.name: seen for package, seen in lock[self.sightings].items()}
         beside = [
             seen.frame_from_package
-            for package, seen in sightings.items()
-            if (seen.frame, seen.tray) == ("tray", plan.tray)
-            and package.name not in observed.packages
+            for name, seen in sightings.items()
+            if (seen.frame, seen.tray) == ("tray", plan.tray) and name not in observed.packages
         ]
         found = inspect_place(
             observed.frame, observed.before_mm, model, plan.tray_from_product,
             limits=self.limits, others=beside,
         )  # fmt: skip
-        new = [name for name in observed.packages if Entity(name) in sightings]
-        poses = [sightings[Entity(name)].frame_from_package for name in new]
-        chosen = nearest(found.tray_from_product[:2, 3], [pose[:2, 3] for pose in poses])
-        flag = Deviation(
-            package="" if chosen is None or found.verdict == "missing" else new[chosen],
-            product=plan.product,
-            verdict=found.verdict,
-            deviation_mm=found.deviation_mm,
-            area_mm2=found.area_mm2,
-            shift_mm=found.shift_mm,
-            turn_deg=found.turn_deg,
-            captured_ns=observed.captured_ns,
-            tray_from_product=found.tray_from_product,
-        )
+        flag = flag_of(found, plan.product, observed, sightings)
         lock[self.region] = found.region
         lock[self.standing] = Standing(plan.product, found.verdict, found.shift_mm, found.turn_deg)
         others: dict[str, Deviation] = lock.get(self.flags, {})
         lock[self.flags] = {**others, lock.entity.name: flag}
+
+
+def flag_of(
+    found: Finding, product: str, observed: Observation, sightings: Mapping[str, Sighting]
+) -> Deviation:
+    """Return the flag of a place: of the new packages the nearest one is meant."""
+    new = [name for name in observed.packages if name in sightings]
+    poses = [sightings[name].frame_from_package for name in new]
+    chosen = nearest(found.tray_from_product[:2, 3], [pose[:2, 3] for pose in poses])
+    return Deviation(
+        package="" if chosen is None or found.verdict == "missing" else new[chosen],
+        product=product,
+        verdict=found.verdict,
+        deviation_mm=found.deviation_mm,
+        area_mm2=found.area_mm2,
+        shift_mm=found.shift_mm,
+        turn_deg=found.turn_deg,
+        captured_ns=observed.captured_ns,
+        tray_from_product=found.tray_from_product,
+    )

@@ -128,9 +128,9 @@ class Setup(Actor):
         lock[self.model] = ARM
         lock[self.task] = task_of()
         now_ns = time.time_ns()
-        ticks = -(-(now_ns + round(self.confirm * 1e9)) // PERIOD_NS)
-        begin_ns = ticks * PERIOD_NS if self.confirm > 0.0 else NEVER_NS
+        begin_ns = NEVER_NS
         if self.confirm > 0.0:
+            begin_ns = -(-(now_ns + round(self.confirm * 1e9)) // PERIOD_NS) * PERIOD_NS
             lock[self.empty] = now_ns
         lock[self.playing] = Playing(
             self.scenario, self.seed, begin_ns, self.seconds, robot=self.confirm > 0.0

@@ -47,13 +47,7 @@ def view_effects(cell: Cell, product: str) -> EffectTree:
 
 
 def show_lineage(cell: Cell, product: str, console: Console) -> None:
-    """Print both trees under the commands that print them.
-
-    Args:
-        cell: The cell, after its last verdict.
-        product: The product whose first view is followed.
-        console: Where progress and table were printed.
-    """
+    """Print both trees under the commands that print them."""
     verdict, view = f"{SYSTEM}/{DEVIATIONS}", f"{view_entity(product, 0)}/{CLOUD}"
     console.print(f"enact why online {verdict} --depth {CAUSES_DEPTH}", style="bold")
     print_tree(drawn(verdict_causes(cell)))
@@ -69,12 +63,7 @@ WAY: Final = ("observation", "net", "candidate", "request", "grasp", "plan")
 
 
 def show_packing(cell: Cell, console: Console) -> None:
-    """Print what was expected and did not come, and where one such verdict comes from.
-
-    Args:
-        cell: The cell, after its last package.
-        console: Where progress and table were printed.
-    """
+    """Print what was expected and did not come, and where one such verdict comes from."""
     online = cell.world("online")
     results, flags = View(online, SYSTEM, RESULTS), View(online, SYSTEM, DEVIATIONS)
     seen = online.view(results, flags)

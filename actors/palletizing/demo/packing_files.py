@@ -61,14 +61,7 @@ class Seen:
 def files_of(
     cell: Cell, config: Path, out: Path, seen: Seen
 ) -> tuple[dict[Path, bytes], list[str]]:
-    """Return the contents of all pictures by file, and a line for each that cannot be drawn.
-
-    Args:
-        cell: The cell, after the last package.
-        config: Its `cell.toml`.
-        out: Folder of the files.
-        seen: What was seen while the run went on.
-    """
+    """Return the contents of all pictures by file, and a line for each that cannot be drawn."""
     standing = {place for place, result in seen.results.items() if result.result in STANDS}
     flags = {place: flag for place, flag in seen.flags.items() if place in standing}
     contents = pictures_of(cell, out, flags)

@@ -51,13 +51,7 @@ class Row:
 def rows_of(
     packages: Sequence[Package], flags: Mapping[str, Deviation], notices: Mapping[str, Notice]
 ) -> list[Row]:
-    """Set verdicts beside the truth.
-
-    Args:
-        packages: The simulated packages, one per stop.
-        flags: What the cell found, by place.
-        notices: Notices to the user, by place.
-    """
+    """Set verdicts beside the truth."""
     rows = []
     for stop, package in enumerate(packages):
         place = place_entity(stop).name

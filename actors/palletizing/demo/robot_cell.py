@@ -29,12 +29,7 @@ _SEED: Final = re.compile(r"seed=\d+")
 
 
 class RobotCell(DemoCell):
-    """A cell with a simulated robot that others run.
-
-    Attributes:
-        hardware: The simulated hardware, which knows the truth.
-        packages: How many packages come.
-    """
+    """A cell with a simulated robot that others run."""
 
     def __init__(self, config: Path, *, hardware: RemoteCell, packages: int) -> None:
         super().__init__(config, log="the logs of its processes")
@@ -157,16 +152,7 @@ def configured(
     ports: Sequence[int],
     hardware: int,
 ) -> str:
-    """Return a `cell.toml` for one run: its own ports, folders, packages and seed.
-
-    Args:
-        template: The text of the `robot_cell.toml` of the application.
-        packages: How many packages come.
-        seed: Seed of all simulated sensors.
-        data: Parent of the shards' folders.
-        ports: One of this host for each shard.
-        hardware: Port of the simulated hardware.
-    """
+    """Return a `cell.toml` for one run: its ports, the hardware's too, folders, packages, seed."""
     parsed = tomllib.loads(template)
     placed(parsed, data, ports)
     for actor in parsed["actors"].values():

@@ -215,15 +215,7 @@ def _follow(cell: Cell, running: DemoCell, truths: Sequence[Package], console: C
 
 @dataclass(frozen=True, slots=True)
 class _Seen:
-    """How far a run is.
-
-    Attributes:
-        notices: Notices to the user, by place.
-        models: Number of trained products.
-        models_ordered: Number of products to train.
-        views: Number of reconstructed views.
-        views_ordered: Number of views to reconstruct.
-    """
+    """How far a run is."""
 
     notices: Mapping[str, Notice]
     models: set[str]

@@ -214,15 +214,7 @@ class Handled:
 
 
 class Stages:
-    """Grounds the stages of one request.
-
-    Args:
-        request: What is asked for.
-        handled: Its package.
-        known: Where everything is.
-        arm: Kinematics and ranges.
-        gripper: What holds the package.
-    """
+    """Grounds the stages of one request."""
 
     def __init__(
         self, request: Request, handled: Handled, known: Known, *, arm: Arm, gripper: Gripper

@@ -125,13 +125,7 @@ class Package:
 def package_sequence(
     count: int, *, seed: int, products: Sequence[str] = DEMO_PRODUCTS
 ) -> list[Package]:
-    """Return the packages of a run, one per stop of the conveyor.
-
-    Args:
-        count: How many packages.
-        seed: Seed of everything random about them.
-        products: Products that come in turn.
-    """
+    """Return the packages of a run, one per stop of the conveyor."""
     sequence: list[Package] = []
     for stop in range(count):
         random = np.random.default_rng([seed, 7, stop])
@@ -144,11 +138,6 @@ def rows_in_contact(count: int, *, seed: int, products: Sequence[str]) -> list[P
     """Return packages that touch the one before in their row, as after a push.
 
     Three of five are sound; the others are dented on top by 4 to 10 mm, or missing.
-
-    Args:
-        count: How many packages.
-        seed: Seed of everything random about them.
-        products: Products that come in turn.
     """
     shapes = {name: Surface.free_form(*product_mesh(name)) for name in products}
     sizes_m = {name: np.ptp(product_mesh(name)[0], axis=0) for name in products}

@@ -75,13 +75,7 @@ class Repeats:
 
 
 class SimulatedTraySensor:
-    """Depth sensor 0.95 m above the tray that sees a given sequence of packages.
-
-    Args:
-        packages: What comes, one package per stop.
-        seed: Seed of the noise.
-        light: Around it.
-    """
+    """Depth sensor 0.95 m above the tray that sees a given sequence of packages."""
 
     def __init__(self, packages: Sequence[Package], *, seed: int, light: Light = DARK) -> None:
         self._packages = packages

@@ -62,16 +62,7 @@ CONDITIONS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Scored:
-    """One package as it was scored.
-
-    Attributes:
-        product: Name of the product.
-        kind: What was the matter with it, see `packages.Truth`.
-        amount: See there.
-        verdict: What was found.
-        pose_mm: Distance of the found from the true position.
-        check_s: Time of the check.
-    """
+    """One package as it was scored."""
 
     product: str
     kind: str

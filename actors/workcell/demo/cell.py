@@ -68,12 +68,7 @@ def options_of(config: Path, out: Path, *, quiet: bool = False) -> Options:
 
 
 def configured(template: str, options: Options) -> dict[str, Any]:
-    """Return the parsed `cell.toml` of a run: scenario, seed, source of the images, grid, layout.
-
-    Args:
-        template: The text of the `cell.toml` of the application.
-        options: What was asked for.
-    """
+    """Return the parsed `cell.toml` of a run: scenario, seed, source of images, grid, layout."""
     config = tomllib.loads(template)
     actors = config["actors"]
     actors[SETUP]["args"] = {

@@ -98,14 +98,7 @@ class Notes:
 
 
 class Conductor:
-    """Conducts one run in a cell that is up.
-
-    Args:
-        cell: The cell.
-        running: What it runs in.
-        options: What was asked for.
-        tell: Called with each line of progress.
-    """
+    """Conducts one run in a cell that is up."""
 
     def __init__(
         self, cell: Cell, running: DemoCell, options: Options, tell: Callable[[str], None]

@@ -90,13 +90,7 @@ def run_demo(options: Options) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What came of a run.
-
-    Attributes:
-        scores: Scores by name.
-        cores: Processor time per second of each process.
-        report: The report as written.
-    """
+    """What came of a run."""
 
     scores: dict[str, float]
     cores: dict[str, float]

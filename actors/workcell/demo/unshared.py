@@ -37,13 +37,7 @@ Key = tuple[str, str, str]
 
 
 class Version(NamedTuple):
-    """A datum.
-
-    Attributes:
-        datum: The object itself.
-        stamp_ns: Capture stamp.
-        number: Of the version of its slot, from 1 on.
-    """
+    """A datum."""
 
     datum: Any
     stamp_ns: int
@@ -114,12 +108,7 @@ class PlainLock:
 
 
 class PlainEach(MutableMapping[Entity, Any]):
-    """The data of a pattern, by entity.
-
-    Args:
-        lock: Of the update.
-        address: Names of context, pattern and aspect.
-    """
+    """The data of a pattern, by entity."""
 
     def __init__(self, lock: PlainLock, address: Key) -> None:
         self._lock, (self._context, _, self._aspect) = lock, address

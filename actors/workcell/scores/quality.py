@@ -69,13 +69,6 @@ def quality(
 ) -> dict[str, dict[str, float]]:
     """Return the scores of each scenario over all seeds, and of all together as `all`.
 
-    Args:
-        scenarios: Their names.
-        seeds: Their seeds.
-        seconds: How long each run is.
-        processes: How many run side by side.
-        told: Called with what is done.
-
     Raises:
         ConfigError: There is no scenario of a name.
     """

@@ -30,14 +30,7 @@ FAR_M: Final = 2.3
 def scan_of_room(
     seed: int, *, boxes: Sequence[Box] = BOXES, views: int = VIEWS, camera: Camera = VGA
 ) -> list[DepthFrame]:
-    """Return depth images of the empty cell, from around each thing at two heights.
-
-    Args:
-        seed: Seed of the noise.
-        boxes: The obstacles of the cell.
-        views: Number of images.
-        camera: The sensor.
-    """
+    """Return depth images of the empty cell, from around each thing at two heights."""
     vertices, triangles = _room(boxes)
     found = []
     for number in range(views):

@@ -39,13 +39,7 @@ EARLY_S: Final = -1.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ahead:
-    """A view that is ready but for the arm.
-
-    Attributes:
-        stamp_ns: Its tick.
-        playing: What it is of.
-        view: The people in the room.
-    """
+    """A view that is ready but for the arm."""
 
     stamp_ns: int
     playing: Playing | None

@@ -35,12 +35,7 @@ class Scene:
 
 
 class Stage:
-    """A scenario as it plays.
-
-    Attributes:
-        scenario: What plays.
-        people: One per walk, in order.
-    """
+    """A scenario as it plays."""
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
