@@ -50,10 +50,14 @@ NOUNS: Final = {
     "actor": Noun("actor", "run, list, check and change actors", "own_actors"),
     "world": Noun("world", "read, write, fork and compare world contexts", "guide"),
     "why": Noun(
-        "world.lineage", "show where a datum comes from: who wrote it, and from which data", "time"
+        "world.lineage",
+        "show where a datum of a cell or a recording comes from: who wrote it, and from which data",
+        "time",
     ),
     "impact": Noun(
-        "world.lineage", "show what was made from a datum, and from that in turn", "time"
+        "world.lineage",
+        "show what was made from a datum of a cell or a recording, and from that in turn",
+        "time",
     ),
     "invalidate": Noun("world.lineage", "make a wrong datum null, and what was made of it", "time"),
     "record": Noun(

@@ -31,6 +31,7 @@ module          what it does
 `recorder`      follows a cell and records it
 `replaying`     commits a recording again
 `exporting`     one world context as of one moment, into a file
+`causes`        what versions were made of, and what was made of them
 ==============  ==================================================================================
 
 `cell.toml` describes how to show the data of an aspect (`enact_dist.config.shows`).  The

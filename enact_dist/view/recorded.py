@@ -10,9 +10,9 @@ import threading
 from typing import TYPE_CHECKING
 
 from enact_dist.errors import ProtocolError
+from enact_dist.recording.causes import RecordedLineage
 from enact_dist.recording.reading import Recording
 from enact_dist.view.catalogue import ListedState, SlotCatalogue
-from enact_dist.view.causes import RecordedLineage
 from enact_dist.view.drawing.scene import ShownDatum, shown_of
 from enact_dist.view.feed import drawable
 from enact_dist.view.source import FoundData

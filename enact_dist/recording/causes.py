@@ -1,16 +1,19 @@
 """Causes and effects of the versions of a recording, as far as it names them.
 
-The first question reads the file once more; from then on, what is known of all its versions, but
-not their data, stays in memory.
+The first question reads the file; from then on, what is known of all its versions, but not their
+data, stays in memory.
 """
 
 from __future__ import annotations
 
+import itertools
 import threading
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
+from enact_dist.config.table import suggestion
 from enact_dist.core.protocol.datum import LockId
 from enact_dist.core.protocol.messages import Cause, DatumRead, SlotState, VersionEntry
+from enact_dist.errors import MisuseError, UnknownWorldError
 from enact_dist.recording.reading import Recording
 from enact_dist.world.lineage import (
     UNRECORDED,
@@ -23,7 +26,7 @@ from enact_dist.world.lineage import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from enact_dist.core.protocol.datum import Slot
@@ -31,6 +34,8 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 NO_LOCK: Final = LockId("", 0, 0)
+COMPARED_MAX: Final = 1000
+"""Names examined for a similar one."""
 
 
 class RecordedSearch(Search):
@@ -38,6 +43,9 @@ class RecordedSearch(Search):
 
     Args:
         path: The file; it is read through.
+
+    Attributes:
+        recording: The file.
 
     Raises:
         ConfigError: The file cannot be read any more.
@@ -53,7 +61,8 @@ class RecordedSearch(Search):
         self._shards: dict[Slot, str] = {}
         self._now_ns = 0
         self._same: dict[Any, Any] = {}
-        for commit in Recording(path).commits():
+        self.recording = Recording(path)
+        for commit in self.recording.commits():
             for recorded in commit.versions:
                 self._take(recorded)
         self._same.clear()
@@ -82,6 +91,56 @@ class RecordedSearch(Search):
         self._now_ns = max(self._now_ns, one.stamp_ns)
         for read in reads:
             self._effects.setdefault(read, []).append(one)
+
+    def start(self, slot: Slot, version: int) -> DatumRead:
+        """Return the version to begin with (0: the newest).
+
+        Raises:
+            UnknownWorldError: The recording has nothing of this world context.
+            MisuseError: It has nothing of this slot, not this version, or names no causes.
+        """
+        path, worlds = self.recording.path, sorted({one.context for one in self._shards})
+        if slot.context not in worlds:
+            raise UnknownWorldError(
+                f"{path} has no world context {slot.context!r}{suggestion(slot.context, worlds)}"
+                f" (it has {', '.join(worlds) or 'none'})",
+                known=tuple(worlds),
+            )
+        found = sorted(
+            (one for one in self._known if one.slot == slot), key=lambda one: one.stamp_ns
+        )
+        if not found:
+            names = (f"{one.entity}/{one.aspect}" for one in self._shards if one[0] == slot[0])
+            near = suggestion(
+                str(slot)[len(slot.context) + 1 :], itertools.islice(names, COMPARED_MAX)
+            )
+            raise MisuseError(
+                f"{path} has no version of {slot}{near}; enact view {path} shows what it has"
+            )
+        chosen = [one for one in found if version in (0, one.version)]
+        if not chosen:
+            numbers = sorted(one.version for one in found)
+            raise MisuseError(
+                f"{path} does not have version {version} of {slot}; of the {len(found)} that it"
+                f" has the oldest is {numbers[0]}, the newest {numbers[-1]}"
+            )
+        if self.recording.facts["format"] == "1":
+            by = self.made(CauseTree, chosen[-1]).made_by
+            raise MisuseError(
+                f"{path} is a recording of format 1, which names no causes: of {slot}"
+                f" v{chosen[-1].version} {by}; a new recording names them"
+            )
+        return chosen[-1]
+
+    def lacks(self) -> Iterator[str]:
+        """Yield what the file does not have, and what trees of it may lack because of that."""
+        if missing := int(self.recording.end.get("missing", "0")):
+            yield f"{missing} versions were missing when {self.recording.path} was recorded"
+        if not self.recording.whole:
+            yield (
+                f"{self.recording.path} was cut off: {self.recording.missing_bytes} bytes after its"
+                " last whole chunk were not used"
+            )
 
     def shard_of(self, slot: Slot) -> str:
         """Return where a slot was committed; "" of one that was not recorded."""
