@@ -38,6 +38,18 @@ def port(text: str) -> int:
     return int(text)
 
 
+RESOLUTION_MIN: Final = 0.25
+"""With less, one thing looks like another."""
+
+
+def resolution(text: str) -> float:
+    """Read a factor from 0.25 to 1; an `argparse` type."""
+    value = above_zero(text)
+    if not RESOLUTION_MIN <= value <= 1.0:
+        raise argparse.ArgumentTypeError(f"{text!r} is no factor from {RESOLUTION_MIN} to 1")
+    return value
+
+
 VERBS: Final = (
     Verb(
         "view", NOUNS["view"].summary, "run_view",
@@ -60,6 +72,10 @@ VERBS: Final = (
                    type=above_zero, default=10.0),
             option("--bytes", "MB", "most megabytes per second that are fetched of the present"
                    " (default: 150)", dest="megabytes_s", type=above_zero, default=150.0),
+            option("--resolution", "FACTOR",
+                   "draw so many pixels for each of the page, in both directions, from 0.25 to 1:"
+                   " 0.5 for a browser without a graphics card (default: viser adapts it)",
+                   type=resolution),
             seconds_of("--timeout", "how long a shard may take to answer (default: 2)", ANSWER_S,
                        dest="timeout_s"),
         ),
@@ -87,7 +103,13 @@ def run_view(options: argparse.Namespace) -> int:
         viewer = stack.enter_context(Viewer(shown, _settings(options)))
         token = os.environ.get(TOKEN_VARIABLE)
         server = stack.enter_context(
-            ViewServer(viewer, host=options.host, port=options.port, token=token)
+            ViewServer(
+                viewer,
+                host=options.host,
+                port=options.port,
+                token=token,
+                resolution=options.resolution,
+            )
         )
         print(f"{viewer.name}: {server.url}", flush=True)
         stop.event.wait()

@@ -54,9 +54,10 @@ class Served:
     def start_shard(self):
         return self._started(["shard", "run", "one", "--cell", "cell.toml"], "ready:")[0]
 
-    def start_view(self, port=0):
+    def start_view(self, port=0, *options, of="cell.toml"):
         """Start a view and return it with its address."""
-        process, line = self._started(["view", "cell.toml", "--port", str(port)], "http")
+        words = ["view", of, "--port", str(port), *options]
+        process, line = self._started(words, "http")
         return process, re.search(r"http://\S+", line)[0]
 
     def _started(self, words, mark):

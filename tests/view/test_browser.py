@@ -5,12 +5,14 @@ A shard, the view and the browser are processes of their own.
 
 import contextlib
 import re
+import threading
 
 import numpy as np
 import pytest
-from browsed import Opened, Served, is_blue, is_empty, is_orange
+from browsed import HIGH_PX, WIDE_PX, Opened, Served, is_blue, is_empty, is_orange
 
 from enact_dist import Aspect, Entity, Lock, Read, Write
+from enact_dist.recording import Recorder
 
 BODY = Aspect("body", np.ndarray)
 SPEED = Aspect("speed", float)
@@ -44,6 +46,10 @@ class ServedBall(Served):
         self.moves += 1
 
 
+_BUFFER = """() => [...document.querySelectorAll("canvas")]
+  .map(one => [one.width, one.height]).sort((one, other) => other[0] - one[0])[0]"""
+
+
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory):
     with contextlib.ExitStack() as stack:
@@ -51,12 +57,16 @@ def shown(tmp_path_factory):
 
 
 @pytest.fixture
-def page(browser, shown):
-    """A new page that has shown everything."""
-    found = Opened(browser, shown.url)
+def page(browser, shown, request):
+    """A new page that has shown everything, of the cell or, if asked for, of a recording of it."""
+    url, run = shown.url, shown.folder / "run.mcap"
+    if getattr(request, "param", "") == "recording":
+        Recorder(shown.cell, run).run(threading.Event(), seconds=0.1)
+        _, url = shown.start_view(of=run.name)
+    found = Opened(browser, url)
     yield found
     found.page.close()
-    host = shown.url.removeprefix("http://")
+    host = url.removeprefix("http://")
     assert {re.sub(r"^(blob:)?(\w+://)?([^/]+).*", r"\3", url) for url in found.requests} == {host}
     assert found.errors == []
 
@@ -78,10 +88,12 @@ def test_page_shows_the_cell_and_its_past(page, shown):
     page.until_middle(is_orange)
 
 
-def test_a_datum_has_values_causes_and_a_label_that_keeps_them(page, shown):
-    """`why` is a tree whose steps can be looked at; only the button keeps versions."""
+@pytest.mark.parametrize("page", ["cell", "recording"], indirect=True)
+def test_a_datum_has_values_causes_and_a_label_that_keeps_them(page, shown, request):
+    """`why` is a tree whose steps can be looked at; only the button keeps versions, in a cell."""
+    is_cell = "recording" not in request.node.name
     page.press("gauge/ (1)")
-    page.text("gauge/left/speed".removeprefix("gauge/"), "1.25")
+    page.text("left/speed", "1.25" if is_cell else "v1")
     page.press("..")
     page.text("ball/body")
     page.choose("datum", "ball/body")
@@ -92,6 +104,9 @@ def test_a_datum_has_values_causes_and_a_label_that_keeps_them(page, shown):
     page.choose("step", "2. online:gauge/left/speed v1")
     page.text("online:gauge/left/speed", "1.25")
     assert shown.cell.pinned() == {}
+    assert page.page.get_by_role("button", name="keep under this label").count() == is_cell
+    if not is_cell:
+        return
     page.page.locator("input:visible").last.fill("incident-7")
     page.press("keep under this label")
     page.text("versions are kept under incident-7")
@@ -99,6 +114,23 @@ def test_a_datum_has_values_causes_and_a_label_that_keeps_them(page, shown):
         "online:ball/body",
         "online:gauge/left/speed",
     }
+    shown.cell.unpin("incident-7")
+
+
+def test_a_page_of_half_the_resolution_draws_the_same_places(shown, browser):
+    """Whichever address was opened: a quarter of the pixels, and the ball where it must be."""
+    view, url = shown.start_view(0, "--resolution", "0.5")
+    page = Opened(browser, url.removesuffix("?fixedDpr=0.5"))
+    assert page.page.url == url != page.requests[0]
+    page.until_middle(is_blue)
+    assert page.page.evaluate(_BUFFER) == [WIDE_PX // 2, HIGH_PX // 2]
+    picture, left = page.picture(), np.array((-1.0, -1.0, 0.0)) / np.sqrt(2.0)
+    for away_m, is_ball in ((0.0, True), (0.5, True), (0.6, False)):  # it seems 0.55 m to the eye
+        column, row = page.pixel_of(away_m * left, (-0.5,) * 3, (0.5,) * 3)
+        assert is_blue(*picture[row, column].astype(int)) == is_ball, away_m
+    assert page.errors == []
+    page.page.close()
+    view.kill()
 
 
 def test_two_pages_show_two_moments_and_outlive_their_shard(page, shown, browser):

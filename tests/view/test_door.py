@@ -100,3 +100,36 @@ def test_token_can_be_chosen(serve):
     assert server.url.endswith("/?token=of the day")
     assert get(server)[0] == 401
     assert get(server, "/?token=of%20the%20day")[0] == 303
+
+
+def test_a_page_is_sent_to_its_resolution(serve):
+    """Its files and its WebSocket are not, nor a page that asks for one of its own."""
+    server = serve(resolution=0.5)
+    assert server.url == f"http://127.0.0.1:{server.port}/?fixedDpr=0.5"
+    for path, place in (
+        ("/", "/?fixedDpr=0.5"),
+        ("/?showStats=1&x=a%26b%0d", "/?showStats=1&x=a%26b%0D&fixedDpr=0.5"),
+    ):
+        status, headers, _ = get(server, path)
+        assert (status, headers["Location"], headers["Cache-Control"]) == (303, place, "no-store")
+    assert get(server, "/?fixedDpr=0.5")[0] == get(server, "/?fixedDpr=1")[0] == 200
+    assert get(server, "/robots.txt")[0] in (200, 404)
+    assert websocket(server) == 101
+    assert get(server, Host="evil.example")[0] == 403
+
+
+def test_a_page_with_a_token_keeps_its_resolution(serve):
+    """The token leaves the address; what else is in it stays."""
+    server = serve(token="secret", resolution=0.25)
+    assert server.url.endswith("/?token=secret&fixedDpr=0.25")
+    assert get(server)[0] == get(server, "/?fixedDpr=0.25")[0] == 401
+    for path, place in (
+        ("/?token=secret", "/?fixedDpr=0.25"),
+        ("/?token=secret&fixedDpr=0.75", "/?fixedDpr=0.75"),
+    ):
+        status, headers, _ = get(server, path)
+        assert (status, headers["Location"]) == (303, place)
+    cookie = headers["Set-Cookie"].partition(";")[0]
+    assert get(server, Cookie=cookie)[1]["Location"] == "/?fixedDpr=0.25"
+    assert get(server, "/?fixedDpr=0.25", Cookie=cookie)[0] == 200
+    assert websocket(server, Cookie=cookie) == 101

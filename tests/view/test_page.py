@@ -126,3 +126,10 @@ def test_a_bound_of_zero_is_refused_in_its_own_words(option, capsys):
     with pytest.raises(SystemExit):
         main(["view", "cell.toml", option, "0"])
     assert f"argument {option}: '0' is no number above zero" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("factor", ["0.2", "1.5", "nan", "half"])
+def test_a_resolution_out_of_range_is_refused(factor, capsys):
+    with pytest.raises(SystemExit):
+        main(["view", "cell.toml", "--resolution", factor])
+    assert f"argument --resolution: {factor!r} is no " in capsys.readouterr().err

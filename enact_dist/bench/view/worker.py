@@ -4,7 +4,7 @@
 writer    writes at 10 Hz images and masks of eight cameras, a hull and two robots
 follower  is woken by the hull of each tick and reads the eight images; says how late it had them
 page      at a line with an address opens it and reads all that it is sent, but draws nothing
-browser   the same with a headless Chromium, which draws
+browser   the same with a headless Chromium, which draws; one page after the other
 ========  =======================================================================================
 
 Each line is answered by one; what a line says begins with its name.
@@ -299,23 +299,24 @@ def _browse() -> None:
             executable_path=str(CHROMIUM), args=[*flags, "--disable-dev-shm-usage"]
         )
         print("ready:", flush=True)
-        url = sys.stdin.readline().strip()
-        page = browser.new_page(viewport={"width": 1300, "height": 850})
-        page.set_default_timeout(BROWSER_S * 1e3)
-        page.goto(url)
-        page.wait_for_function(_SAID)
-        page.wait_for_selector("canvas")
-        print("shown:", time.perf_counter_ns(), flush=True)
-        sys.stdin.readline()  # from here on it counts
-        page.evaluate(_FRAMES)
-        begun_s = time.perf_counter()
-        said: list[float] = []
-        stopped = _asked()
-        while not stopped.wait(1.0):
-            said.append(float(page.evaluate(_SAID) or 0.0))
-        frames = page.evaluate("() => window.enactFrames")
-        frames_s = frames / (time.perf_counter() - begun_s)
-        print("did:", json.dumps({"updates": said, "frames_s": frames_s}), flush=True)
+        for line in iter(sys.stdin.readline, ""):
+            page = browser.new_page(viewport={"width": 1300, "height": 850})
+            page.set_default_timeout(BROWSER_S * 1e3)
+            page.goto(line.strip())
+            page.wait_for_function(_SAID)
+            page.wait_for_selector("canvas")
+            print("shown:", time.perf_counter_ns(), flush=True)
+            sys.stdin.readline()  # from here on it counts
+            page.evaluate(_FRAMES)
+            begun_s = time.perf_counter()
+            said: list[float] = []
+            stopped = _asked()
+            while not stopped.wait(1.0):
+                said.append(float(page.evaluate(_SAID) or 0.0))
+            frames = page.evaluate("() => window.enactFrames")
+            frames_s = frames / (time.perf_counter() - begun_s)
+            page.close()
+            print("did:", json.dumps({"updates": said, "frames_s": frames_s}), flush=True)
         browser.close()
 
 

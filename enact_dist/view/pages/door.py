@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from functools import partial
 from http.cookies import CookieError, SimpleCookie
 from typing import Any, Final
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs, urlencode, urlsplit
 
 import viser
 import websockets.asyncio.server as websocket_server
@@ -26,6 +26,8 @@ from websockets.http11 import Request, Response
 
 COOKIE: Final = "enact_view"
 QUERY: Final = "token"
+RESOLUTION: Final = "fixedDpr"
+"""By this part of its address viser's page draws so many pixels for each of its own."""
 LOOPBACK: Final = frozenset({"localhost", "127.0.0.1", "::1"})
 _ASK: Final = """<!doctype html><meta charset="utf-8"><title>enact view</title>
 <form style="font: 16px sans-serif; margin: 4em"><p>This page needs the token that `enact view` has
@@ -47,10 +49,17 @@ class Door:
     Args:
         host: Address that the server listens on.
         token: What a browser has to know; "" lets in all that asks this host for it.
+        resolution: With what resolution pages draw; None: as viser decides.
+
+    Attributes:
+        query: What an address with all that a browser has to say ends with.
     """
 
-    def __init__(self, host: str, token: str) -> None:
+    def __init__(self, host: str, token: str, resolution: float | None = None) -> None:
         self._token = token
+        self._resolution = "" if resolution is None else f"{RESOLUTION}={resolution:g}"
+        asked = "&".join(filter(None, (token and f"{QUERY}={token}", self._resolution)))
+        self.query = asked and f"/?{asked}"
         self._names = LOOPBACK | {host} if is_loopback(host) else None
 
     def answer(self, request: Request) -> Response | None:
@@ -61,13 +70,26 @@ class Door:
         origin = request.headers.get("Origin")
         if origin is not None and urlsplit(origin).netloc != host:
             return _refused(f"A page of {origin!r} may not read this one.")
+        path, query = urlsplit(request.path).path, parse_qs(urlsplit(request.path).query)
         if not self._token or self._knows(_cookie_of(request)):
+            is_page = path == "/" and "Upgrade" not in request.headers
+            if self._resolution and is_page and RESOLUTION not in query:
+                return _response(http.HTTPStatus.SEE_OTHER, "", Location=self._page(query))
             return None
-        given = parse_qs(urlsplit(request.path).query).get(QUERY, [""])[0]
+        given = query.get(QUERY, [""])[0]
         if self._knows(given):
             cookie = f"{COOKIE}={given}; HttpOnly; SameSite=Strict; Path=/"
-            return _response(http.HTTPStatus.SEE_OTHER, "", Location="/", Set_Cookie=cookie)
+            place = self._page(query)
+            return _response(http.HTTPStatus.SEE_OTHER, "", Location=place, Set_Cookie=cookie)
         return _response(http.HTTPStatus.UNAUTHORIZED, _ASK, Content_Type="text/html")
+
+    def _page(self, query: dict[str, list[str]]) -> str:
+        """Return where the page is: with the resolution that was asked for, and without a token."""
+        rest = {name: values for name, values in query.items() if name != QUERY}
+        asked = urlencode(rest, doseq=True)
+        if RESOLUTION not in query:
+            asked = "&".join(filter(None, (asked, self._resolution)))
+        return f"/?{asked}" if asked else "/"
 
     def _knows(self, given: str) -> bool:
         return hmac.compare_digest(given.encode(), self._token.encode())

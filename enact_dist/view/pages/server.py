@@ -109,10 +109,12 @@ class ViewServer(Closing):
         host: Address to listen on.
         port: Port; the next free one if it is taken.
         token: What a browser has to know; None: nothing on the loopback, else a random one.
+        resolution: So many pixels are drawn for each of a page, in both directions; None: as many
+            as viser decides.
 
     Attributes:
         port: Port that it listens on.
-        url: Where to open it, with the token.
+        url: Where to open it, with the token and the resolution.
 
     Raises:
         ConfigError: viser is not installed, or no port of the address can be listened on.
@@ -125,18 +127,20 @@ class ViewServer(Closing):
         host: str = "127.0.0.1",
         port: int = 8080,
         token: str | None = None,
+        resolution: float | None = None,
     ) -> None:
         require_viser()
         port = free_port(host, port)
-        from enact_dist.view.pages.door import QUERY, Door, GuardedServer, is_loopback
+        from enact_dist.view.pages.door import Door, GuardedServer, is_loopback
 
         if token is None:
             token = "" if is_loopback(host) else secrets.token_urlsafe(TOKEN_BYTES)
 
+        door = Door(host, token, resolution)
         # A browser may go while its page draws: what is on its way then is no loss.
         warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
         with contextlib.redirect_stdout(io.StringIO()):  # its own table of addresses
-            self._server = GuardedServer(host, port, door=Door(host, token), label=viewer.name)
+            self._server = GuardedServer(host, port, door=door, label=viewer.name)
         self._server.gui.configure_theme(
             show_share_button=False, show_logo=False, control_width="large"
         )
@@ -156,9 +160,8 @@ class ViewServer(Closing):
         self._server.on_client_connect(self._open)
         self._server.on_client_disconnect(self._close)
         self.port = self._server.get_port()
-        self.url = f"http://{f'[{host}]' if ':' in host else host}:{self.port}"
-        if token:
-            self.url += f"/?{QUERY}={token}"
+        name = f"[{host}]" if ":" in host else host
+        self.url = f"http://{name}:{self.port}{door.query}"
 
     def _open(self, client: ClientHandle) -> None:
         page = Page(self._viewer, client)
