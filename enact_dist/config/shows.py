@@ -29,9 +29,9 @@ kind             takes the first part of the datum, in the order of its fields, 
                  relative to ``cell.toml``: the visual shapes of its links, their base in ``frame``,
                  moved by its joints in the order of the file, or as ``joints`` names them
 ``pose``         a rigid (4, 4), metres: where the thing is in ``frame``
-``trajectory``   a path: an array (N, 3) of floats, metres; (N, 7), a place and a unit quaternion in
-                 each row; or rigid (N, 4, 4): the line through the places in ``frame``, which is
-                 drawn again as a whole with each version
+``trajectory``   a path: an array (N, 3) of floats, metres; (N, 2), at height 0; (N, 7), a place and
+                 a unit quaternion in each row; or rigid (N, 4, 4): the line through the places in
+                 ``frame``, which is drawn again as a whole with each version
 ``transform``    a rigid (4, 4), metres: where ``frame`` is in ``parent``; with ``inverse = true``
                  in the aspect's table: where ``parent`` is in ``frame``
 ``calibration``  a pinhole camera: ``width_px height_px fx_px fy_px cx_px cy_px``, or

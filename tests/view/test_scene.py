@@ -246,7 +246,7 @@ def test_a_trajectory_is_a_line_through_its_places(path):
 @pytest.mark.parametrize(
     "path",
     [
-        np.zeros((3, 2)),
+        np.zeros((3, 4)),
         np.zeros((3, 3), np.int64),
         np.hstack((PLACES_M, 2.0 * TURNS)),  # seven joints, or capsules
         np.stack([np.eye(4), 2.0 * np.eye(4)]),
@@ -255,6 +255,11 @@ def test_a_trajectory_is_a_line_through_its_places(path):
 )
 def test_what_is_no_path_does_not_fit_a_trajectory(path):
     assert shown(path, "trajectory").drawables == {"trajectory": None}
+
+
+def test_a_path_of_two_coordinates_lies_at_height_0():
+    node = one_node(shown(PLACES_M[:, :2].astype(np.float32), "trajectory", frame="cell"))
+    assert node.places_m.tolist() == (PLACES_M * (1.0, 1.0, 0.0)).tolist()
 
 
 def test_a_path_of_less_than_two_places_or_too_far_away_is_no_line():

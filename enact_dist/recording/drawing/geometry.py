@@ -36,11 +36,13 @@ def path_of(array: NDArray[Any]) -> NDArray[np.float64] | None:
     """Return the places (N, 3) along a path, metres; None if the array is none.
 
     Args:
-        array: Floats: (N, 3) places, (N, 7) places each with a unit quaternion behind it, or
-            (N, 4, 4) rigid transforms.
+        array: Floats: (N, 3) places, (N, 2) places at height 0, (N, 7) places each with a unit
+            quaternion behind it, or (N, 4, 4) rigid transforms.
     """
     if array.dtype.kind != "f":
         return None
+    if array.ndim == 2 and array.shape[1] == 2:
+        return np.column_stack((array, np.zeros(len(array)))).astype(np.float64)
     if array.ndim == 2 and array.shape[1] == 3:
         return np.asarray(array, np.float64)
     if array.ndim == 2 and array.shape[1] == 7:

@@ -19,6 +19,8 @@ from enact_dist import testing
 from enact_dist.actor.check import check_cell, declarations_of
 from enact_dist.config.read import load_config
 from enact_dist.errors import ConfigError
+from enact_dist.recording.drawing.drawables import drawables_of
+from enact_dist.wire.payload import decode_untyped, encode_datum
 
 
 def test_shipped_cell_fits_together():
@@ -63,6 +65,21 @@ def test_both_layouts_of_the_cameras_fit_together(tmp_path, separate):
     assert len(config["actors"]) == 34 - (0 if separate else 2 * words.CAMERA_COUNT)
     found = check_cell(load_config(tmp_path / "cell.toml"))
     assert [one.text for one in found if one.level == "error"] == []
+
+
+def test_where_a_person_will_be_is_drawn_on_the_floor():
+    """As `enact view` and a recording read the shipped cell."""
+    aspects = {aspect.name: aspect.shows for aspect in load_config(TEMPLATE).aspects}
+    ahead_s = np.linspace(0.1, 1.0, 10)
+    centre_m = np.stack((1.2 * ahead_s, 0.5 - ahead_s), axis=1)
+    prediction = words.Prediction(ahead_s, centre_m, np.full(10, 0.4))
+    value = decode_untyped(encode_datum(prediction, words.Prediction))
+
+    shows = aspects[words.PREDICTION.name]
+    path = drawables_of(value, shows)["trajectory"]
+
+    assert np.array_equal(path.places_m, np.column_stack((centre_m, np.zeros(10))))
+    assert shows.frame_of("human/1") == "cell"
 
 
 def test_decisions_are_made_without_the_truth():
