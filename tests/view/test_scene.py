@@ -375,19 +375,23 @@ def test_a_large_image_is_made_small():
     assert node.image.shape == (240, 320, 3)
 
 
-def test_an_image_is_as_large_as_its_side_asks_and_its_packed_mask_fits_it():
-    """Of a mask that is packed along its rows no more is unpacked than is shown."""
+@pytest.mark.parametrize("packs", [True, False])
+@pytest.mark.parametrize("box", [(8, 24, 16, 40), (0, 48, 0, 64), (17, 18, 21, 22), (5, 44, 3, 62)])
+def test_an_image_is_as_large_as_its_side_asks_and_its_mask_fits_it(box, packs):
+    """Of a mask no more is unpacked than is shown, and around the box that it covers nothing."""
+    top, bottom, left, right = box
     covers = np.zeros((48, 64), bool)
-    covers[8:24, 16:40] = True
+    covers[top:bottom, left:right] = True
     image = shown(np.full((48, 64, 3), 100, np.uint8), "image", entity="camera/1")
-    packed = {"packed": np.packbits(covers, axis=1)}
-    mask = shown(packed, "mask", entity="camera/1", aspect="mask")
-    assert (mask.drawables["mask"].pixels == 255 * covers).all()
-    data = {one.recorded.slot: one for one in (image, mask)}
-    for side_px, step in ((64, 1), (32, 2), (16, 4)):
-        (node,) = scene_of(data, sides_px={"camera/1": side_px}).nodes.values()
-        red = (node.image == (177, 75, 65)).all(axis=2)
-        assert (red == covers[::step, ::step]).all()
+    for covered in (covers, np.zeros_like(covers)):
+        value = {"packed": np.packbits(covered, axis=1)} if packs else covered
+        mask = shown(value, "mask", entity="camera/1", aspect="mask")
+        assert (mask.drawables["mask"].pixels == 255 * covered).all()
+        data = {one.recorded.slot: one for one in (image, mask)}
+        for side_px, step in ((64, 1), (32, 2), (22, 3), (16, 4), (4, 16)):
+            (node,) = scene_of(data, sides_px={"camera/1": side_px}).nodes.values()
+            red = (node.image == (177, 75, 65)).all(axis=2)
+            assert (red == covered[::step, ::step]).all()
 
 
 # ---------------------------------------------------------------- poses, labels, files

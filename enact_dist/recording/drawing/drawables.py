@@ -74,6 +74,22 @@ class ShownImage:
             np.negative(rows, out=rows)  # 1 becomes 255
         return rows[:, ::step]
 
+    def covered(self, step: int) -> tuple[int, int, NDArray[np.uint8]]:
+        """Return what a mask covers, as `every_nth` pixel: a box, its first row and column.
+
+        The box (h, w) holds 1 and 0; all pixels around it are 0, and none of them is unpacked.
+        """
+        rows = self._pixels[::step]
+        there = [np.flatnonzero(rows.any(axis=axis)) for axis in (1, 0)]
+        if not len(there[0]):
+            return 0, 0, np.zeros((0, 0), np.uint8)
+        (top, bottom), (left, right) = ((int(one[0]), int(one[-1]) + 1) for one in there)
+        box = rows[top:bottom, left:right]
+        if self._packed:
+            box, left = np.unpackbits(box, axis=1), 8 * left
+        first = -left % step
+        return top, (left + first) // step, (box[:, first::step] != 0).view(np.uint8)
+
 
 class ShownCloud(NamedTuple):
     """Points.

@@ -39,7 +39,11 @@ def rgb_of(shown: ShownImage, side_px_max: int = SIDE_PX_MAX) -> NDArray[np.uint
 
 
 def _at_most(shown: ShownImage, side_px_max: int) -> NDArray[Any]:
-    return shown.every_nth(max(1, -(-max(shown.shape[:2]) // side_px_max)))
+    return shown.every_nth(_step(shown, side_px_max))
+
+
+def _step(shown: ShownImage, side_px_max: int) -> int:
+    return max(1, -(-max(shown.shape[:2]) // side_px_max))
 
 
 def _as_bytes(pixels: NDArray[Any]) -> NDArray[np.uint8]:
@@ -56,15 +60,14 @@ def _as_bytes(pixels: NDArray[Any]) -> NDArray[np.uint8]:
 
 def with_mask(image: NDArray[np.uint8], mask: ShownImage) -> NDArray[np.uint8]:
     """Return an image with what a mask covers in red; a mask of another shape is left out."""
-    covers = _at_most(mask, max(image.shape[:2])) > 0
-    if covers.shape != image.shape[:2]:
+    step = _step(mask, max(image.shape[:2]))
+    if tuple(-(-side // step) for side in mask.shape[:2]) != image.shape[:2]:
         return image
     found = image.copy()
-    rows, columns = np.flatnonzero(covers.any(axis=1)), np.flatnonzero(covers.any(axis=0))
-    if len(rows):  # a mask covers a small part: what lies around it is not touched
-        box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-        covered = np.repeat(covers[box].view(np.uint8), 3, axis=1)
-        boxed = found.reshape(len(found), -1)[box[0], 3 * box[1].start : 3 * box[1].stop]
-        boxed >>= covered
-        boxed += covered * np.tile(HALF_MASK_COLOUR, covered.shape[1] // 3)
+    top, left, covers = mask.covered(step)  # a small part: what lies around it is not touched
+    covered = np.repeat(covers, 3, axis=1)
+    rows = found.reshape(len(found), -1)[top : top + len(covered)]
+    boxed = rows[:, 3 * left : 3 * left + covered.shape[1]]
+    boxed >>= covered
+    boxed += covered * np.tile(HALF_MASK_COLOUR, covers.shape[1])
     return found
