@@ -129,18 +129,26 @@ def test_a_file_that_is_no_recording_is_named(enact, tmp_path):
         assert done.status == 1
 
 
-def test_what_the_file_lacks_is_said_beside_the_tree(enact, run, tmp_path):
-    """Versions that were not recorded, and what follows the last whole chunk."""
-    cut = tmp_path / "cut.mcap"
-    cut.write_bytes(run.read_bytes()[:-1000])
-    done = enact("why", "training", "milk/sum", "--recording", cut)
-    assert done.status == 0
-    assert "cut.mcap was cut off: " in done.err
-    path = tmp_path / "gaps.mcap"
+def copied(run, path):
+    """Write the commits of a recording into another file; return that one, open."""
     file = RecordingFile(path, {}, aspects=lambda _: None, shows=None)
     for commit in Recording(run).commits():
         file.add_commit(commit.versions, commit.log_ns)
-    file.close({"missing": "7"})
-    done = enact("impact", "training", "view/0/count", "--recording", path, "--json")
-    assert done.err == f"enact: 7 versions were missing when {path} was recorded\n"
-    assert done.json["children"]
+    file.end_chunk()
+    return file
+
+
+def test_what_the_file_lacks_is_said_beside_the_tree(enact, run, tmp_path):
+    """Versions that were not recorded, and what follows the last whole chunk."""
+    cut, gaps = tmp_path / "cut.mcap", tmp_path / "gaps.mcap"
+    copied(run, cut).abandon()
+    with cut.open("ab") as stream:
+        stream.write(b"\x06" + (1 << 20).to_bytes(8, "little") + b"begun")
+    copied(run, gaps).close({"missing": "7"})
+    for path, lacking in (
+        (cut, f"{cut} was cut off: 14 bytes after its last whole chunk were not used"),
+        (gaps, f"7 versions were missing when {gaps} was recorded"),
+    ):
+        done = enact("impact", "training", "view/0/count", "--recording", path, "--json")
+        assert (done.status, done.err) == (0, f"enact: {lacking}\n")
+        assert done.json["children"]
