@@ -37,6 +37,18 @@ def test_busy_session_forgets_its_own_oldest_names_alone():
     assert "ann-1000000000000000" in names
 
 
+def test_rows_of_numbers_are_forgotten_by_their_age():
+    """A client numbers each length in a row of its own: those of one lie far below the other's."""
+    names = UsedNames()
+    for number in range(NUMBERS_MAX):
+        names.add(f"ann-{(1 << 20) + number:x}")
+        names.add(f"ann-{(2 << 20) + number:x}")
+
+    for row in (1 << 20, 2 << 20):
+        latest = range(NUMBERS_MAX - NUMBERS_MAX // 4, NUMBERS_MAX)
+        assert all(f"ann-{row + number:x}" in names for number in latest)
+
+
 def test_session_that_has_used_no_name_for_longest_is_forgotten():
     """Clients come and go for as long as a shard runs."""
     names = UsedNames()
@@ -59,4 +71,4 @@ def test_name_takes_eight_bytes():
         names.add(f"ann-{number:x}")
 
     assert sys.getallocatedblocks() - before < 100
-    assert sys.getsizeof(names._numbers["ann", 0]) < 10 * NUMBERS_MAX
+    assert sum(map(sys.getsizeof, names._numbers["ann", 0])) < 10 * NUMBERS_MAX
