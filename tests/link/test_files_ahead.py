@@ -84,7 +84,8 @@ def one_session_has_few_of_them(folder):
     desk = PayloadDesk(folder, 1 << 30)
     asked(desk, ahead=1000)
     asked(desk, "ann-1000", ahead=1000)
-    assert desk.figures()["payload_drafts"] == 1 + FILES_MAX + 1
+    figures = desk.figures()
+    assert (figures["payload_drafts"], figures["files_ahead"]) == (2, FILES_MAX)
 
     large = BYTES_MAX // 2
     asked(desk, "eve-1", ahead=5, total=large)
@@ -153,7 +154,7 @@ def what_was_given_up_does_not_come_again(folder):
         desk.stage(Stage("ann", file, 0, 0, NOTHING))
     asked(desk, ahead=2)
 
-    assert names(folder) == ["ann-3"]
+    assert names(folder) == ["ann-3", "ann-4"]  # in their place
 
 
 RULES = (
@@ -363,8 +364,8 @@ def cell(request, make_settings, endpoint, monkeypatch):
     found.shard.stop(drain_s=0.0)
 
 
-def drafts(cell):
-    return cell.shard.host.payloads.figures()["payload_drafts"]
+def files_ahead(cell):
+    return cell.shard.host.payloads.figures()["files_ahead"]
 
 
 def published(cell, until, number, *, settled=True):
@@ -385,10 +386,12 @@ def test_steps_of_a_camera_need_no_call_for_their_files(cell, until):
     for number in range(20):
         published(cell, until, number)
         ready = min(number, 1)
-        until(lambda ready=ready: drafts(cell) == ready)
+        until(lambda ready=ready: files_ahead(cell) == ready)
 
     assert [message.ahead for message in cell.staged] == [0, 1]
-    assert cell.shard.host.payloads.figures()["payloads_adopted"] == 20
+    figures = {one.name: one for one in cell.shards()}["s0"].counters
+    assert (figures["payloads_adopted"], figures["files_ahead_used"]) == (20, 18)
+    assert (figures["files_ahead"], figures["files_ahead_bytes"]) == (1, SIZE)
     assert "payload_fallbacks" not in cell.statistics()
 
 
@@ -460,9 +463,9 @@ def test_session_that_ends_leaves_no_file(cell, until):
     """Unused ones go with it, and are no sign of a client that died."""
     for number in range(3):
         published(cell, until, number)
-    until(lambda: drafts(cell) == 1)
+    until(lambda: files_ahead(cell) == 1)
     cell.close()
 
-    until(lambda: drafts(cell) == 0)
+    until(lambda: files_ahead(cell) == 0)
     figures = cell.shard.host.payloads.figures()
     assert (figures["files_ahead_removed"], figures.get("drafts_swept", 0)) == (1, 0)

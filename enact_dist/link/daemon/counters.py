@@ -269,6 +269,11 @@ OF_A_SHARD: Final[dict[str, Figure]] = {
         "unfinished large data dropped to make room for a client below its share",
         "find the client that stages much and commits nothing: enact actor ls; or raise the limit",
     ),
+    "files_ahead": _gauge("files made ahead of large data and not used yet"),
+    "files_ahead_bytes": _gauge("bytes of these; part of payload_bytes"),
+    "files_ahead_used": Figure(
+        "files made ahead that a commit has named: each spared its client a call"
+    ),
     "files_ahead_removed": Figure(
         "files made ahead of large data and removed unused: their client paused or ended, or room"
         " was short"

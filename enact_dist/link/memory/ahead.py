@@ -51,10 +51,15 @@ class AheadOf(NamedTuple):
         return self.file.rpartition("-")[0]
 
     def names(self) -> list[str]:
-        """Return what the files are called, in the order in which they are used."""
+        """Return what the files are called, in the order in which they are used.
+
+        None is of the row behind, whose payloads may have another length.
+        """
         session, _, digits = self.file.rpartition("-")
         number = int(digits, 16)
-        return [f"{session}-{number + n:x}" for n in range(1, min(self.behind, FILES_MAX) + 1)]
+        end = ((number >> ROW_BITS) + 1) << ROW_BITS
+        numbers = range(number + 1, min(number + 1 + min(self.behind, FILES_MAX), end))
+        return [f"{session}-{number:x}" for number in numbers]
 
 
 @dataclass(slots=True)
@@ -103,3 +108,9 @@ class NamesAhead:
             return 0
         row.asked = {-1: 0, 0: 1}.get(row.asked, FILES_MAX)
         return row.asked
+
+    def unusable(self, size: int) -> None:
+        """Ask for none soon: a file that the shard has made cannot be opened here."""
+        row = self._rows.get(size)
+        if row is not None:
+            row.asked = -1

@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
+from enact_dist.core.protocol.messages import Refused
+from enact_dist.wire.limits import PAYLOAD_BYTES_MIN
+
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from enact_dist.core.protocol.messages import Commit, Prepare
     from enact_dist.link.memory.maps import Pages, PlainMemory
     from enact_dist.link.memory.shared_folder import SharedFolder
 
 DRAFT_BYTES_MAX: Final = 2 << 30
 """Bytes of drafts in plain memory that may wait for their commits."""
+NO_ROOM: Final = "no_room"
+"""The code of a refusal for lack of room."""
+SHARES: Final = 4
+"""Each client always has a quarter of the room for drafts; more only while others need none."""
 
 
 @dataclass(slots=True)
@@ -52,6 +62,60 @@ class Drafted:
         if self.writing:
             return False
         return self.have == self.size or (self.shared and not self.have and not self.beyond)
+
+
+def plain_bytes(drafts: Mapping[str, Drafted]) -> int:
+    """Return the bytes of drafts in plain memory, counting an overhead for small ones."""
+    return sum(max(one.size, PAYLOAD_BYTES_MIN) for one in drafts.values() if not one.shared)
+
+
+def unused(drafts: Mapping[str, Drafted], missing: int) -> list[str]:
+    """Return the oldest files made ahead and not asked for, until they have so many bytes."""
+    found = []
+    for file, draft in drafts.items():
+        if missing <= 0:
+            break
+        if not draft.asked:
+            missing -= draft.size
+            found.append(file)
+    return found
+
+
+def beyond_share(
+    drafts: Mapping[str, Drafted], most: int, owner: str, total: int, *, shared: bool
+) -> tuple[list[str], int]:
+    """Return the oldest drafts of clients beyond their share, and the bytes of these.
+
+    Args:
+        drafts: All drafts, the oldest first.
+        most: Bytes that all clients may have.
+        owner: Who wants room; none is found where this one would be beyond its share itself.
+        total: How many bytes it wants.
+        shared: Whether in the folder, or in plain memory.
+    """
+    share, staged = most // SHARES, Counter[str]()
+    found, freed = [], 0
+    drafts = {file: draft for file, draft in drafts.items() if draft.shared == shared}
+    for draft in drafts.values():
+        staged[draft.owner] += draft.size
+    if staged[owner] + total > share:
+        return [], 0
+    for file, draft in drafts.items():
+        if freed < total and staged[draft.owner] > share:
+            staged[draft.owner] -= draft.size
+            freed += draft.size
+            found.append(file)
+    return found, freed
+
+
+def no_room(session: str, total: int, used: int, most: int, biggest: str) -> Refused:
+    """Return the refusal of a draft.  `biggest`: the largest slots, for people."""
+    return Refused(
+        NO_ROOM,
+        f"session {session[:8]} asked for a payload of {total} bytes; {used} of at most {most}"
+        f" are in use{biggest}; raise shared_bytes_max, keep fewer versions, or release"
+        " arrays and locks that still reference old ones",
+    )
 
 
 def names_payloads(message: Commit | Prepare) -> bool:

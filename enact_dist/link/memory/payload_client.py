@@ -24,6 +24,7 @@ from enact_dist.core.protocol.datum import Datum
 from enact_dist.core.protocol.messages import Refused, Stage, Staged
 from enact_dist.errors import EnactError
 from enact_dist.link.memory.ahead import NamesAhead
+from enact_dist.link.memory.drafts import NO_ROOM
 from enact_dist.link.memory.maps import (
     Pages,
     anonymous_file,
@@ -33,7 +34,6 @@ from enact_dist.link.memory.maps import (
     map_file,
     map_to_fill,
 )
-from enact_dist.link.memory.payload_desk import NO_ROOM
 from enact_dist.link.memory.shared_folder import OpenedFolder, open_shared
 from enact_dist.link.memory.use_marks import ClientPage, retains
 from enact_dist.link.refusals import error_of
@@ -269,6 +269,8 @@ class SharedPayloads:
             return Draft(shard, file, size, self._opened(shared, name, size, os.O_RDWR))
         except OSError as error:
             # Most likely the folder is read-only here.
+            with self._mutex:
+                shared.ahead.unusable(size)
             self._count("payload_fallbacks")
             _log.info("payload %s of shard %s: %s", file, shard, error)
             self.drop(shard, file)

@@ -26,15 +26,25 @@ from __future__ import annotations
 import logging
 import threading
 import weakref
-from collections import Counter, deque
+from collections import deque
 from dataclasses import replace
+from errno import EEXIST
 from functools import partial
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from enact_dist.core.protocol.messages import Refused, Staged, WriteItem
 from enact_dist.link.clock import Clock, SystemClock
 from enact_dist.link.memory.ahead import BYTES_MAX, FILES_MAX, AheadOf
-from enact_dist.link.memory.drafts import DRAFT_BYTES_MAX, Drafted, names_payloads
+from enact_dist.link.memory.drafts import (
+    DRAFT_BYTES_MAX,
+    NO_ROOM,
+    Drafted,
+    beyond_share,
+    names_payloads,
+    no_room,
+    plain_bytes,
+    unused,
+)
 from enact_dist.link.memory.maps import Pages, PlainMemory, body_of, leftovers, plain_memory
 from enact_dist.link.memory.names import UsedNames
 from enact_dist.link.memory.payload_files import PayloadFiles
@@ -51,14 +61,10 @@ if TYPE_CHECKING:
 
 GAPS_MAX: Final = 1024
 """Slices of one draft that may arrive before a preceding one."""
-NO_ROOM: Final = "no_room"
-"""The code of a refusal for lack of room."""
 DRAFT_NS: Final = 30_000_000_000
 """A draft of a session without a lock is dropped after this time without a slice."""
 FULL_NS: Final = 100_000_000
 """After a payload did not fit, the desk frees no room for one as large during this time."""
-SHARES: Final = 4
-"""Each client always has a quarter of the room for drafts; more only while others need none."""
 ROOM_S: Final = 1.0
 """How long a new draft waits for files that are being removed."""
 SILENT_NS: Final = 60_000_000_000
@@ -108,7 +114,7 @@ class PayloadDesk:
         self._files = 0
         self.wants_ahead: deque[AheadOf] = deque()  # what `make_ahead` has to do
         self._adopted: dict[str, weakref.ref[Pages | PlainMemory]] = {}
-        self._over = UsedNames()
+        self._over, self._taken_back = UsedNames(), UsedNames()
         self._bytes = self._gone = 0
         self._full = 0, 0
         self._silent_until_ns = 0
@@ -164,9 +170,14 @@ class PayloadDesk:
             if sum(file in self._drafts for file in names) > wanted.behind // 2:
                 continue  # several at once disturb a client less than one after each commit
             for file in names:
-                with self._opening[hash(file) % len(self._opening)]:
+                opening = self._opening[hash(file) % len(self._opening)]
+                if not opening.acquire(blocking=False):
+                    break  # perhaps another client waits for room: this one shall not wait for it
+                try:
                     if not self._made_ahead(file, wanted):
                         break
+                finally:
+                    opening.release()
 
     def _want(self, file: str, draft: Drafted) -> None:
         if draft.ahead:
@@ -176,11 +187,12 @@ class PayloadDesk:
         """Make one file unless its name is in use, or was; return False if there is no room."""
         session, size = wanted.session, wanted.size
         with self._mutex:
-            if file in self._drafts or file in self._over:
+            if any(file in known for known in (self._drafts, self._over, self._taken_back)):
                 return True
             mine = [draft.size for draft in self._drafts.values() if draft.session == session]
             many = len(mine) > FILES_MAX or sum(mine) + size > BYTES_MAX
-            if self._disk is None or many or self._bytes + size > self._bytes_max // 2:
+            short = self._bytes + size > self._bytes_max // 2
+            if self._disk is None or many or short or self._disk.is_nearly_full():
                 return False
             self._bytes += size
             self._files += 1
@@ -197,18 +209,27 @@ class PayloadDesk:
                 self._drafts[file] = draft
         return True
 
-    def _gave_back(self, total: int) -> bool:
-        """Remove files made ahead, and not asked for, for so many bytes; return if any were."""
+    def _gave_back(self, missing: int) -> bool:
+        """Remove files made ahead, and not asked for, of so many bytes; return if any were."""
         with self._mutex:
-            missing, gone = self._bytes + total - self._bytes_max, 0
-            for file in [file for file, one in self._drafts.items() if not one.asked]:
-                if missing > 0:
-                    missing -= self._drafts.pop(file).size  # its client may ask for it yet
-                    gone += 1
-        if gone:
-            self._count("files_ahead_removed", gone)
+            files = unused(self._drafts, missing)
+            self._remove(files)
+        if files:
             leftovers().wait(ROOM_S)
-        return bool(gone)
+        return bool(files)
+
+    def _remove(self, files: list[str], asked_for: str = "") -> list[Drafted]:
+        """Drop and return drafts; count those that were asked for apart.  The mutex is held.
+
+        A file made ahead comes again only if its client asks for it: it may be filling the one that
+        is removed, and its commit would publish the new one, with nothing in it.
+        """
+        gone = [self._drafts.pop(file) for file in files]
+        for file, draft in zip(files, gone, strict=True):
+            self._count(asked_for if draft.asked else "files_ahead_removed")
+            if not draft.asked:
+                self._taken_back.add(file)
+        return gone
 
     def _take(self, file: str, draft: Drafted, offset: int, slice_: Datum) -> Staged | Refused:
         end = offset + slice_.size
@@ -223,7 +244,7 @@ class PayloadDesk:
             if self._drafts.get(file) is not draft:
                 return Staged(file, draft.size, False)  # a late copy, as in `stage`
             if not slice_.size or end <= draft.have:
-                return self._staged(file, draft)
+                return Staged(file, draft.have, draft.shared)
             draft.writing += 1
         try:
             body_of(draft.memory)[offset:end] = slice_.body
@@ -234,10 +255,7 @@ class PayloadDesk:
         with self._mutex:
             draft.writing -= 1
             draft.add(offset, end)
-            return self._staged(file, draft)
-
-    def _staged(self, file: str, draft: Drafted) -> Staged:
-        return Staged(file, draft.have, draft.shared)
+            return Staged(file, draft.have, draft.shared)
 
     def _opened(self, session: str, owner: str, file: str, total: int) -> Drafted | Refused | None:
         """Return a new draft; None if its name has been used meanwhile."""
@@ -253,7 +271,8 @@ class PayloadDesk:
             else:
                 self._travels(f"its limit of {self._bytes_max} bytes is reached", self._disk.folder)
         if memory is None:
-            drafted = self._drafted()
+            with self._mutex:
+                drafted = plain_bytes(self._drafts)
             full = drafted + max(total, PAYLOAD_BYTES_MIN) > self._draft_bytes_max
             if full and not self._displaced(owner, total, shared=False):
                 return self._refused(session, total, drafted, self._draft_bytes_max)
@@ -273,7 +292,9 @@ class PayloadDesk:
 
     def _has_room(self, total: int) -> bool:
         """Count the bytes of a new file if they fit under the limit, removing history if needed."""
-        if self._reserved(total) or (self._gave_back(total) and self._reserved(total)):
+        if self._reserved(total):
+            return True
+        if self._gave_back(self._bytes + total - self._bytes_max) and self._reserved(total):
             return True
         until_ns, least = self._full
         if self._clock.monotonic_ns() < until_ns and total >= least:
@@ -308,55 +329,35 @@ class PayloadDesk:
         Otherwise a client that only stages and never commits would fill the folder.  A client that
         still wanted its draft learns of the loss at its commit and stages it again.
         """
-        share = (self._bytes_max if shared else self._draft_bytes_max) // SHARES
-        staged: Counter[str] = Counter()
-        given_up, freed = [], 0
+        most = self._bytes_max if shared else self._draft_bytes_max
         with self._mutex:
-            drafts = [
-                (file, draft.owner, draft.size)
-                for file, draft in self._drafts.items()
-                if draft.shared == shared
-            ]
-            for _, other, size in drafts:
-                staged[other] += size
-            if staged[owner] + total > share:
-                return False
-            for file, other, size in drafts:
-                if freed < total and staged[other] > share:
-                    staged[other] -= size
-                    freed += size
-                    given_up.append(file)
-            for file in given_up:
-                if self._drafts.pop(file).asked:
+            files, freed = beyond_share(self._drafts, most, owner, total, shared=shared)
+            for file in files:
+                if self._drafts[file].asked:
                     self._over.add(file)
-        if not given_up:
-            return False
-        self._count("drafts_displaced", len(given_up))
-        leftovers().wait(ROOM_S)
-        return freed >= total
-
-    def _drafted(self) -> int:
-        """Return the bytes of drafts in plain memory, counting an overhead for small ones."""
-        with self._mutex:
-            plain = [draft.size for draft in self._drafts.values() if not draft.shared]
-        return sum(max(size, PAYLOAD_BYTES_MIN) for size in plain)
+            self._remove(files, "drafts_displaced")
+        if files:
+            leftovers().wait(ROOM_S)
+        return bool(files) and freed >= total
 
     def _refused(self, session: str, total: int, used: int, most: int) -> Refused:
         self._count("payloads_refused")
-        return Refused(
-            NO_ROOM,
-            f"session {session[:8]} asked for a payload of {total} bytes; {used} of at most {most}"
-            f" are in use{self._biggest()}; raise shared_bytes_max, keep fewer versions, or release"
-            " arrays and locks that still reference old ones",
-        )
+        return no_room(session, total, used, most, self._biggest())
 
     def _in_folder(self, disk: PayloadFiles, file: str, total: int) -> Pages | None:
         """Return the memory of a new file whose bytes are counted; None if that fails."""
-        try:
-            return self._filed(disk, file, total)
-        except OSError as error:
-            self._travels(str(error.strerror or error), disk.folder)
-            return None
+        why = ""  # not the error itself, which would keep the frames of all callers, and their data
+        for again in (False, True):
+            try:
+                return self._filed(disk, file, total)
+            except OSError as error:
+                why, code = str(error.strerror or error), error.errno
+            # Unused files may have filled the folder, or this one has yet to disappear.
+            more = not again and (self._gave_back(total) or code == EEXIST)
+            if not (more and leftovers().wait(ROOM_S) and self._reserved(total)):
+                break
+        self._travels(why, disk.folder)
+        return None
 
     def _filed(self, disk: PayloadFiles, file: str, total: int) -> Pages:
         try:
@@ -379,8 +380,10 @@ class PayloadDesk:
     def drop(self, file: str) -> None:
         """Drop a draft, if it exists."""
         with self._mutex:
-            self._drafts.pop(file, None)
+            draft = self._drafts.pop(file, None)
             self._over.add(file)
+        if draft is not None:
+            self._want(file, draft)
 
     # ---------------------------------------------------------------- adoption
 
@@ -425,6 +428,8 @@ class PayloadDesk:
             del self._drafts[file]
             self._adopted[file] = weakref.ref(draft.memory, partial(self._unadopted, file))
             self._over.add(file)
+            if not draft.asked:
+                self._count("files_ahead_used")
         self._want(file, draft)
         if draft.shared and self._disk is not None and not self._disk.publish(file):
             return None
@@ -465,11 +470,8 @@ class PayloadDesk:
                 if not lives(draft.session)
                 or (draft.touched_ns < late_ns and not works(draft.session))
             ]
-            gone = [self._drafts.pop(file) for file in over]
-        if gone:
-            unused = sum(not draft.asked for draft in gone)
-            self._count("files_ahead_removed", unused)
-            self._count("drafts_swept", len(gone) - unused)
+            gone = self._remove(over, "drafts_swept")
+        del gone  # once others may go on
 
     def drafts(self) -> dict[str, str]:
         """Return the session of each draft, by its name."""
@@ -481,12 +483,15 @@ class PayloadDesk:
     def figures(self) -> dict[str, int]:
         """Return counters and current values: files, bytes, drafts."""
         with self._mutex:
+            ahead = [draft.size for draft in self._drafts.values() if not draft.asked]
             return {
                 **self.counters,
                 "payload_files": self._files,
                 "payload_bytes": self._bytes,
                 "payload_bytes_max": self._bytes_max if self._disk is not None else 0,
-                "payload_drafts": len(self._drafts),
+                "payload_drafts": len(self._drafts) - len(ahead),
+                "files_ahead": len(ahead),
+                "files_ahead_bytes": sum(ahead),
             }
 
     def _count(self, name: str, count: int = 1) -> None:

@@ -54,6 +54,11 @@ class PayloadFiles:
         finally:
             os.close(made)
 
+    def is_nearly_full(self) -> bool:
+        """Whether less than a quarter of the file system is left, which others may share."""
+        system = os.fstatvfs(self.folder.descriptor)
+        return system.f_bavail < system.f_blocks // 4
+
     def publish(self, file: str) -> bool:
         """Make a draft read-only; return False if it is gone."""
         try:

@@ -1,0 +1,226 @@
+"""Files ahead under faults, at the desk alone: what is removed, late, full, or asked for wrongly."""
+
+import errno
+import os
+import random
+import threading
+from types import SimpleNamespace
+
+import pytest
+from payload_drafts import NOTHING, SIZE, adopted, names
+from test_files_ahead import asked, committed
+
+from enact_dist.core.protocol.messages import Stage, Staged
+from enact_dist.link.memory import payload_files
+from enact_dist.link.memory.ahead import BYTES_MAX, FILES_MAX, ROW_BITS, NamesAhead
+from enact_dist.link.memory.maps import leftovers
+from enact_dist.link.memory.payload_desk import PayloadDesk
+from enact_dist.testing import ManualClock
+
+LIVE = frozenset({"ann", "eve"}).__contains__
+
+
+def took_back_for_room(desk):
+    """Another client asks for most of the room, and gives it up."""
+    asked(desk, "eve-1", ahead=0, total=19 * SIZE)
+    desk.drop("eve-1")
+    assert leftovers().wait(30)
+
+
+def took_back_after_a_time(desk):
+    """No lock was seen when the shard looked."""
+    desk._clock.advance(30.1)
+    desk.sweep(LIVE, lambda _: False)
+    assert leftovers().wait(30)
+
+
+@pytest.mark.parametrize("took_back", [took_back_for_room, took_back_after_a_time])
+def test_file_that_its_client_fills_does_not_come_again_empty(folder, took_back):
+    """Of two threads one still fills a file that the shard takes back; the other one commits."""
+    desk = PayloadDesk(folder, 20 * SIZE, clock=ManualClock())
+    asked(desk, "ann-1", ahead=FILES_MAX)
+    with (folder.path / "ann-3").open("r+b") as opened:
+        took_back(desk)
+        asked(desk, "ann-2", ahead=FILES_MAX)
+        shown = committed(desk, 2)
+        opened.write(b"x" * SIZE)
+
+        found = committed(desk, 3)
+
+    assert len(shown.body) == SIZE
+    assert found.body == b"", "the file of this name has none of its bytes"
+    assert asked(desk, "ann-3", ahead=0) == Staged("ann-3", 0, True), "its client may ask for it"
+
+
+def test_files_end_with_their_row(folder):
+    """Behind it are the payloads of another length, which would find files of the wrong one."""
+    desk = PayloadDesk(folder, 60 * SIZE)
+    last = (1 << ROW_BITS) - 3
+    asked(desk, f"ann-{last:x}", ahead=FILES_MAX)
+    asked(desk, f"eve-{(1 << 64) - 1:x}", ahead=FILES_MAX)
+
+    assert names(folder) == [f"ann-{last + n:x}" for n in range(3)] + [f"eve-{(1 << 64) - 1:x}"]
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT])
+def test_files_ahead_go_before_a_full_folder_costs_a_datum_its_place(folder, monkeypatch, code):
+    """Others fill the file system, whatever this shard's own limit says."""
+    desk = PayloadDesk(folder, 60 * SIZE)
+    asked(desk, "ann-1", ahead=3)
+
+    def fallocate(*arguments):
+        if len(list(folder.path.glob("*-*"))) > 4:
+            raise OSError(code, os.strerror(code))
+        os.posix_fallocate(*arguments)
+
+    full = SimpleNamespace(**{**vars(os), "posix_fallocate": fallocate})
+    monkeypatch.setattr(payload_files, "os", full)
+
+    assert asked(desk, "eve-1", ahead=0) == Staged("eve-1", 0, True)
+    figures = desk.figures()
+    assert (figures["files_ahead"], figures["files_ahead_removed"]) == (2, 1)
+    assert (figures["payload_bytes"], figures.get("payload_fallbacks", 0)) == (4 * SIZE, 0)
+
+
+def test_nearly_full_file_system_gets_no_files_ahead(folder, monkeypatch):
+    """Several shards share it, and each may have less than its limit."""
+    desk = PayloadDesk(folder, 60 * SIZE)
+    left = {"f_bavail": 249, "f_blocks": 1000}
+    near = SimpleNamespace(**{**vars(os), "fstatvfs": lambda _: SimpleNamespace(**left)})
+    monkeypatch.setattr(payload_files, "os", near)
+    asked(desk, "ann-1", ahead=1)
+    assert names(folder) == ["ann-1"]
+
+    left["f_bavail"] = 250
+    asked(desk, "ann-1", ahead=2)
+    assert names(folder) == ["ann-1", "ann-2", "ann-3"]
+
+
+def test_file_that_has_yet_to_disappear_is_asked_for(folder):
+    """It is large, so that another thread frees it: who asks in that moment waits for it."""
+    size = 1 << 20
+    desk = PayloadDesk(folder, 60 * size)
+    asked(desk, "ann-1", ahead=1, total=size)
+    assert leftovers().wait(30)
+    go_on = threading.Event()
+    leftovers().later(go_on.wait, 30.0)
+    desk.sweep({"eve"}.__contains__, lambda _: False)
+    assert (folder.path / "ann-2").exists()
+    threading.Timer(0.05, go_on.set).start()
+
+    assert asked(desk, "ann-2", ahead=0, total=size) == Staged("ann-2", 0, True)
+    assert "payload_fallbacks" not in desk.figures()
+
+
+def test_client_that_waits_for_room_holds_up_no_files_of_another(folder):
+    """The names of the two fall under one mutex; the files are made behind the next commit."""
+    waits, go_on = threading.Event(), threading.Event()
+
+    def make_room(_):
+        waits.set()
+        assert go_on.wait(30)
+
+    desk = PayloadDesk(folder, 20 * SIZE, make_room=make_room)
+    numbers = (f"eve-{number:x}" for number in range(1, 1000))
+    slow = next(name for name in numbers if (hash(name) - hash("ann-2")) % 16 == 0)
+    waiter = threading.Thread(target=asked, args=(desk, slow, 0, 21 * SIZE))
+    waiter.start()
+    assert waits.wait(30)
+    asked(desk, "ann-1", ahead=1)
+    assert not (folder.path / "ann-2").exists()
+    go_on.set()
+    waiter.join()
+
+    asked(desk, "ann-1", ahead=2)
+    assert (folder.path / "ann-2").exists()
+
+
+def test_file_that_is_given_up_is_followed_by_another(folder):
+    """A block that fails after it has filled one costs the next no call."""
+    desk = PayloadDesk(folder, 60 * SIZE)
+    asked(desk, "ann-1", ahead=1)
+    for number in range(2, 5):
+        desk.stage(Stage("ann", f"ann-{number:x}", 0, 0, NOTHING))
+        desk.make_ahead()
+
+    assert names(folder) == ["ann-1", "ann-5"]
+
+
+def test_client_that_cannot_open_its_files_asks_for_no_more():
+    """Its folder is read-only: files made ahead would be made for nobody."""
+    ahead, asks = NamesAhead(iter(range(1, 100)).__next__), []
+    for _ in range(5):
+        ahead.take(SIZE, 0.0)
+        asks.append(ahead.asks(SIZE))
+        ahead.unusable(SIZE)
+
+    assert asks == [0] * 5
+
+
+@pytest.mark.parametrize("size", [1, 65_536, 65_537, BYTES_MAX // FILES_MAX, BYTES_MAX, 1 << 26])
+def test_length_at_each_limit_leaves_nothing(folder, size):
+    """Small ones lie in memory and have none ahead; the largest are alone."""
+    desk = PayloadDesk(folder, 1 << 30)
+    answer = asked(desk, "ann-1", ahead=FILES_MAX, total=size)
+    ahead = min(FILES_MAX, BYTES_MAX // size - 1) if size > 65_536 and size < BYTES_MAX else 0
+    assert (answer.shared, desk.figures()["files_ahead"]) == (size > 65_536, ahead)
+    assert asked(desk, "ann-1", ahead=FILES_MAX, total=0) == Staged("ann-1", 0, False)
+
+    desk.sweep(lambda _: False, lambda _: False)
+    figures = (names(folder), *(desk.figures()[f"payload_{name}"] for name in ("bytes", "files")))
+    assert figures == ([], 0, 0)
+
+
+def _step(desk, folder, rng, clock, numbers, shown):
+    """Do one thing that a client, the shard or the system might do."""
+    session = rng.choice(("ann", "bob", "eve"))
+    number = numbers[session]
+    file, size = f"{session}-{number:x}", rng.choice((SIZE, SIZE, 70_000, 300_000))
+    act = rng.randrange(9)
+    if act < 3:
+        asked(desk, file, ahead=rng.randrange(9), total=size)
+    elif act < 6 and (folder.path / file).exists():
+        numbers[session] += 1
+        length = (folder.path / file).stat().st_size
+        shown.append(adopted(desk, file, size=length, session=session))
+        del shown[: rng.randrange(len(shown) + 1)]
+    elif act == 6:
+        numbers[session] += 1
+        desk.stage(Stage(session, file, 0, 0, NOTHING))
+    elif act == 7:
+        clock.advance(rng.choice((1.0, 40.0)))
+        desk.sweep({"ann", "bob"}.__contains__, {"ann"}.__contains__)
+    else:
+        (folder.path / file).unlink(missing_ok=True)  # somebody has cleared the folder
+    if rng.random() < 0.8:
+        desk.make_ahead()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_nothing_is_left_after_a_thousand_rounds_of_faults(folder, monkeypatch, seed):
+    """No file, no byte of the share, no draft; and the counts agree with the folder all along."""
+    rng, clock, shown = random.Random(seed), ManualClock(), []
+
+    def fallocate(*arguments):
+        if rng.random() < 0.1:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        os.posix_fallocate(*arguments)
+
+    full = SimpleNamespace(**{**vars(os), "posix_fallocate": fallocate})
+    monkeypatch.setattr(payload_files, "os", full)
+    desk = PayloadDesk(folder, 30 * SIZE, make_room=lambda _: shown.clear(), clock=clock)
+    numbers = dict.fromkeys(("ann", "bob", "eve"), 1)
+    for _ in range(1000):
+        _step(desk, folder, rng, clock, numbers, shown)
+        figures = desk.figures()
+        assert 0 <= figures["files_ahead_bytes"] <= figures["payload_bytes"] <= 30 * SIZE
+    counted = desk.figures()
+    for counter in ("files_ahead_used", "files_ahead_removed", "payload_fallbacks"):
+        assert counted[counter] > 0
+
+    shown.clear()
+    desk.sweep(lambda _: False, lambda _: False)
+    left = names(folder)
+    figures = desk.figures()
+    assert (left, figures["payload_bytes"], figures["payload_files"]) == ([], 0, 0)
+    assert (figures["payload_drafts"], figures["files_ahead"]) == (0, 0)
