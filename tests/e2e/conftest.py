@@ -6,6 +6,7 @@ import queue
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 from pathlib import Path
 
@@ -183,3 +184,19 @@ def make_process(tmp_path):
     yield make
     for process in reversed(processes):
         process.end()
+
+
+@pytest.fixture
+def root(monkeypatch, request):
+    """A shared folder on a file system of its own, so that its memory can be weighed."""
+    folder = Path(tempfile.mkdtemp(prefix="enact-test-"))
+    size = getattr(request, "param", 2 << 30)
+    command = ["mount", "-t", "tmpfs", "-o", f"size={size},mode=0700", "tmpfs", str(folder)]
+    mounted = subprocess.run(command, capture_output=True, text=True, check=False)
+    if mounted.returncode:
+        folder.rmdir()
+        pytest.skip(f"no tmpfs can be mounted here: {mounted.stderr.strip()}")
+    monkeypatch.setenv("ENACT_SHARED_FOLDER", str(folder))
+    yield folder
+    subprocess.run(["umount", "-l", str(folder)], check=True)
+    folder.rmdir()

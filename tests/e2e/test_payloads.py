@@ -6,7 +6,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from pathlib import Path
 
@@ -30,22 +29,6 @@ piece = Entity("piece")
 both = pytest.mark.carrier("socket", "zenoh")
 some_without = pytest.mark.carrier("auto")
 """Some of these processes see no socket of the shard, others do."""
-
-
-@pytest.fixture
-def root(monkeypatch, request):
-    """A shared folder on a file system of its own, so that its memory can be weighed."""
-    folder = Path(tempfile.mkdtemp(prefix="enact-test-"))
-    size = getattr(request, "param", 2 << 30)
-    command = ["mount", "-t", "tmpfs", "-o", f"size={size},mode=0700", "tmpfs", str(folder)]
-    mounted = subprocess.run(command, capture_output=True, text=True, check=False)
-    if mounted.returncode:
-        folder.rmdir()
-        pytest.skip(f"no tmpfs can be mounted here: {mounted.stderr.strip()}")
-    monkeypatch.setenv("ENACT_SHARED_FOLDER", str(folder))
-    yield folder
-    subprocess.run(["umount", "-l", str(folder)], check=True)
-    folder.rmdir()
 
 
 @pytest.fixture

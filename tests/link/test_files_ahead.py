@@ -368,14 +368,14 @@ def files_ahead(cell):
     return cell.shard.host.payloads.figures()["files_ahead"]
 
 
-def published(cell, until, number, *, settled=True):
+def published(cell, until, number, *, size=SIZE, settled=True):
     """Commit an image that says which one it is, and read it back."""
     world = cell.world("online")
     write, view = Write(world, CAMERA, IMAGE), View(world, CAMERA, IMAGE)
     with Lock(write) as lock:
-        lock[write] = np.full(SIZE, number % 256, np.uint8)
+        lock[write] = np.full(size, number % 256, np.uint8)
     image = world.view(view)[view]
-    assert image.size == SIZE
+    assert image.size == size
     assert (image == number % 256).all()
     if settled:
         until(lambda: not cell.shard.host.payloads.wants_ahead)
@@ -407,14 +407,25 @@ def test_file_that_is_gone_is_asked_for(cell, until):
     assert "payload_fallbacks" not in cell.statistics()
 
 
-def test_file_that_goes_while_it_is_filled_costs_no_datum(cell, until):
-    """The commit names what is not there any more, and then brings it."""
+@pytest.mark.parametrize("lengths", [2, ROWS_MAX + 1, 30])
+def test_datum_of_ever_other_lengths_has_its_own_bytes(cell, until, lengths):
+    """Some are used again soon, some are forgotten meanwhile, some never come again."""
+    for number in range(30):
+        published(cell, until, number, size=SIZE + 64 * (number % lengths))
+
+    assert cell.shard.host.payloads.figures()["payloads_adopted"] == 30
+    assert "payload_fallbacks" not in cell.statistics()
+
+
+@pytest.mark.parametrize("size", [SIZE, BYTES_MAX // FILES_MAX])
+def test_file_that_goes_while_it_is_filled_costs_no_datum(cell, until, size):
+    """The commit names what is not there any more; then its bytes come, apart where they are many."""
     for number in range(3):
-        published(cell, until, number)
+        published(cell, until, number, size=size)
     world = cell.world("online")
     write, view = Write(world, CAMERA, IMAGE), View(world, CAMERA, IMAGE)
     with Lock(write) as lock:
-        lock[write] = np.full(SIZE, 77, np.uint8)
+        lock[write] = np.full(size, 77, np.uint8)
         cell.shard.host.payloads.sweep(lambda _: False, lambda _: False)
 
     assert (world.view(view)[view] == 77).all()

@@ -228,8 +228,12 @@ class SharedPayloads:
         _log.info("no grants of shard %s are kept: %s", shard, error)
 
     def leave_pages(self) -> None:
-        """Close the pages that a forked child has inherited, without giving marks back."""
+        """Close the pages that a forked child has inherited, without giving marks back.
+
+        The files ahead are left to the parent, too: a child would open the same one as it does.
+        """
         for shared in list(self._shards.values()):
+            shared.ahead = NamesAhead(self._rows)
             if shared.page is not None:
                 shared.page.close()
 
