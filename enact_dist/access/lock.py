@@ -30,6 +30,7 @@ from enact_dist.access.trigger import LockStatistics, Triggered
 from enact_dist.access.writes import Asked, Writing, reads_of, refuse_changed
 from enact_dist.core.client.plan import Phase
 from enact_dist.core.protocol.messages import SlotVersion
+from enact_dist.core.state.clock import device_token
 from enact_dist.errors import (
     DatumTypeError,
     LockHeldError,
@@ -478,9 +479,10 @@ class Lock(Triggered):
         """Fencing numbers (shard, epoch, number), for outside devices that compare them.
 
         Of two grants of one shard the later has the larger (epoch, number); blocks may share one.
+        If the shard has no folder, that holds while its host's clock is not set back.
         """
         parts = self._lock.parts if self._lock is not None else []
-        return tuple((p.shard, p.token.epoch, p.token.number) for p in parts if p.token)
+        return tuple((p.shard, *device_token(p.token)) for p in parts if p.token)
 
     def statistics(self) -> LockStatistics:
         """Return what the lock went through so far."""

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Final, Generic, TypeVar
 from enact_dist.core.protocol.messages import Refused
 
 if TYPE_CHECKING:
-    from enact_dist.core.protocol.datum import LockId, Position
+    from enact_dist.core.protocol.datum import LockId, Position, Token
     from enact_dist.core.protocol.records import Recovered
 
 K = TypeVar("K", str, tuple[str, int])
@@ -63,6 +63,18 @@ def unkept_epoch(wall_ns: int) -> int:
 def is_kept(epoch: int) -> bool:
     """Whether a shard has begun this epoch with what it had kept of the one before."""
     return epoch < UNKEPT_FROM
+
+
+def device_token(token: Token) -> tuple[int, int]:
+    """Return a token as an outside device compares it, whatever kind its epoch is of.
+
+    A shard may get a folder, or lose it: both kinds are in seconds here, so that the later start
+    has the larger pair unless both begin within one second.
+    """
+    if is_kept(token.epoch):
+        return token.epoch, token.number
+    second, millisecond = divmod(token.epoch, 1000)
+    return second, (millisecond << 32) + token.number
 
 
 def is_older(epoch: int, than: int) -> bool:
