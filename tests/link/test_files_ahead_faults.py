@@ -1,6 +1,7 @@
 """Files ahead under faults, at the desk alone: what is removed, late, full, or asked for wrongly."""
 
 import errno
+import itertools
 import os
 import random
 import threading
@@ -14,6 +15,7 @@ from enact_dist.core.protocol.messages import Stage, Staged
 from enact_dist.link.memory import payload_files
 from enact_dist.link.memory.ahead import BYTES_MAX, FILES_MAX, ROW_BITS, NamesAhead
 from enact_dist.link.memory.maps import leftovers
+from enact_dist.link.memory.names import UsedNames
 from enact_dist.link.memory.payload_desk import PayloadDesk
 from enact_dist.testing import ManualClock
 
@@ -169,6 +171,81 @@ def test_length_at_each_limit_leaves_nothing(folder, size):
     desk.sweep(lambda _: False, lambda _: False)
     figures = (names(folder), *(desk.figures()[f"payload_{name}"] for name in ("bytes", "files")))
     assert figures == ([], 0, 0)
+
+
+class Threads:
+    """The threads of a client: each opens its file, or asks for it, fills it, and commits late."""
+
+    def __init__(self, desk, folder, rng):
+        self.desk, self.folder, self.rng = desk, folder, rng
+        self.ahead, self.filled = NamesAhead(iter(range(1, 1000)).__next__), {}
+        self.own = self.missing = 0
+
+    def fill(self):
+        number, ready = self.ahead.take(SIZE, 0.0)
+        file = f"ann-{number:x}"
+        if not (ready and (self.folder.path / file).exists()):
+            answer = asked(self.desk, file, ahead=self.ahead.asks(SIZE))
+            if not isinstance(answer, Staged) or not answer.shared:
+                return
+        self.filled[file] = (self.folder.path / file).open("r+b")
+
+    def commit(self):
+        """Fill the rest of any file, and see that a commit has these bytes or none."""
+        file = self.rng.choice(sorted(self.filled))
+        content = file.encode().ljust(SIZE, b".")
+        with self.filled.pop(file) as opened:
+            opened.write(content)
+        found = bytes(committed(self.desk, int(file[4:], 16)).body)
+        assert found in (b"", content), f"{file} has bytes of its own"
+        self.own, self.missing = self.own + bool(found), self.missing + (not found)
+
+
+def commits_have_their_own_bytes(folder, seed):
+    """Four threads at once, others that need the room, and a shard that looks for idle ones."""
+    rng, clock = random.Random(seed), ManualClock()
+    desk = PayloadDesk(folder, 20 * SIZE, clock=clock)
+    threads, others = Threads(desk, folder, rng), itertools.count(1)
+    for _ in range(600):
+        act = rng.randrange(10)
+        if act < 4 and len(threads.filled) < 4:
+            threads.fill()
+        elif act < 8 and threads.filled:
+            threads.commit()
+        elif act == 8:
+            file = f"eve-{next(others):x}"
+            asked(desk, file, ahead=0, total=rng.randrange(8, 19) * SIZE)
+            desk.drop(file)
+            assert leftovers().wait(30)
+        elif rng.random() < 0.2:
+            clock.advance(31.0)
+            desk.sweep(LIVE, lambda _: False)
+            assert leftovers().wait(30)
+        desk.make_ahead()
+    for opened in threads.filled.values():
+        opened.close()
+    assert min(threads.own, threads.missing, desk.figures()["files_ahead_used"]) > 5
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_commit_has_the_bytes_of_its_client_or_none(folder, seed):
+    """Whatever is taken back meanwhile; without bytes they come with the commit."""
+    commits_have_their_own_bytes(folder, seed)
+
+
+def test_wrong_edit_that_makes_a_file_again_is_found(folder, monkeypatch):
+    """What was taken back is forgotten at once."""
+    remove = PayloadDesk._remove
+
+    def wrong(desk, files):
+        gone = remove(desk, files)
+        desk._taken_back = UsedNames()
+        return gone
+
+    monkeypatch.setattr(PayloadDesk, "_remove", wrong)
+    with pytest.raises(AssertionError, match="has bytes of its own"):
+        for seed in range(3):
+            commits_have_their_own_bytes(folder, seed)
 
 
 def _step(desk, folder, rng, clock, numbers, shown):

@@ -15,7 +15,7 @@ from enact_dist.core.protocol.datum import Datum, LockId, Position, Slot
 from enact_dist.core.shard import on_view, owners
 from enact_dist.core.state import sessions
 from enact_dist.errors import PermissionDeniedError, ProtocolError
-from enact_dist.link.memory import payload_desk
+from enact_dist.link.memory import drafts
 from enact_dist.link.memory.names import SERIES_MAX
 from enact_dist.link.refusals import error_of
 from enact_dist.link.socket import service as socket_service
@@ -390,4 +390,4 @@ def test_page_on_security_says_the_bounds_that_hold():
 
     assert said == held
     assert f"{socket_service.KEPT_FREE} of {socket_service.CONNECTIONS_MAX:,} are free" in str(rows)
-    assert payload_desk.SHARES == 4
+    assert drafts.SHARES == 4

@@ -146,10 +146,8 @@ class PayloadDesk:
                 draft = self._drafts.get(file) or self._opened(
                     message.session, owner or message.session, file, total
                 )
-        if draft is None:
-            return Staged(file, total, False)
-        if isinstance(draft, Refused):
-            return draft
+        if not isinstance(draft, Drafted):
+            return draft or Staged(file, total, False)
         if draft.size != total:
             return Refused("protocol", f"payload {file} has {draft.size} bytes, not {total}")
         if not draft.asked or message.ahead != draft.ahead:
@@ -218,17 +216,17 @@ class PayloadDesk:
             leftovers().wait(ROOM_S)
         return bool(files)
 
-    def _remove(self, files: list[str], asked_for: str = "") -> list[Drafted]:
-        """Drop and return drafts; count those that were asked for apart.  The mutex is held.
+    def _remove(self, files: list[str]) -> list[Drafted]:
+        """Drop and return drafts, and count those made ahead.  The mutex is held.
 
         A file made ahead comes again only if its client asks for it: it may be filling the one that
         is removed, and its commit would publish the new one, with nothing in it.
         """
         gone = [self._drafts.pop(file) for file in files]
         for file, draft in zip(files, gone, strict=True):
-            self._count(asked_for if draft.asked else "files_ahead_removed")
             if not draft.asked:
                 self._taken_back.add(file)
+                self._count("files_ahead_removed")
         return gone
 
     def _take(self, file: str, draft: Drafted, offset: int, slice_: Datum) -> Staged | Refused:
@@ -335,8 +333,9 @@ class PayloadDesk:
             for file in files:
                 if self._drafts[file].asked:
                     self._over.add(file)
-            self._remove(files, "drafts_displaced")
+            displaced = sum(draft.asked for draft in self._remove(files))
         if files:
+            self._count("drafts_displaced", displaced)
             leftovers().wait(ROOM_S)
         return bool(files) and freed >= total
 
@@ -470,8 +469,9 @@ class PayloadDesk:
                 if not lives(draft.session)
                 or (draft.touched_ns < late_ns and not works(draft.session))
             ]
-            gone = self._remove(over, "drafts_swept")
-        del gone  # once others may go on
+            gone = self._remove(over)
+        if gone:  # freed once others may go on
+            self._count("drafts_swept", sum(draft.asked for draft in gone))
 
     def drafts(self) -> dict[str, str]:
         """Return the session of each draft, by its name."""
