@@ -101,6 +101,7 @@ class PermissionDeniedError(EnactError):
         right: Which one: "read", "write", "change", "init", "delete", "fork", …
         world: The world context of the slot.
         entity: Its entity, or the requested pattern.
+        aspect: Its aspect.
         rule: Where a rule would give it, such as "cell.toml, line 41".
     """
 
@@ -222,6 +223,7 @@ class ShardUnreachableError(LinkError):
     """A shard did not answer.
 
     Attributes:
+        shard: Its name.
         endpoint: Where it was expected.
     """
 

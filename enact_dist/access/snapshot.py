@@ -136,6 +136,7 @@ class SlotInfo:
         size_bytes: Length of the datum's body: arrays, texts and bytes over 256 B, long lists; 0
             for everything else.
         null_reason: Why it is null, or the empty string.
+        shard: The shard that stores it.
     """
 
     entity: Entity

@@ -99,8 +99,10 @@ class LockStatistics:
     """Times and counts of one lock.
 
     Attributes:
+        granted: Whether it was granted.
         waited_s: From asking to the grant.
         held_s: From the grant to the end of the block, or until now.
+        shards: The shards that it locked.
         fetched: How many data were decoded.
     """
 

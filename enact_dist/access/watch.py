@@ -103,11 +103,15 @@ class Change:
     """One slot has a new state.
 
     Attributes:
+        entity: The entity.
+        aspect: Name of the aspect.
         version: The slot's version; starts again for volatile aspects when their shard restarts.
+        position: Position of the commit.
         gap: How many versions of this slot were skipped before this one; at least 1 where its
             versions started again, since this watch may have missed the last ones before that.
         null: Whether the slot is null now.
         captured_ns: When the datum was captured, according to its writer (0: unknown, or null).
+        world: Name of the world context.
     """
 
     entity: Entity

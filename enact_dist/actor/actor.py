@@ -192,6 +192,7 @@ class Declaration:
     Attributes:
         actor: Name of the class.
         requests: The declared requests by attribute name.
+        triggers: Those that trigger.
         shared: Writes that declare other writers.
         roles: Names of the world roles that the requests use, in order of appearance.
         per_entity: Whether some request refers to the triggering entity.

@@ -274,8 +274,11 @@ class Version(FormerNames, Generic[T]):
     """One version of a datum, without it.
 
     Attributes:
+        world: Its world context.
+        entity: Its entity.
         aspect: Its aspect; of the type `object` if the program has not named the aspect's type.
         version: Its number, counted from 1 by slot.
+        position: Position of its commit.
         until_ns: Stamp of the version that replaced it; 0: it is the newest one.
         stamp_ns: When the datum was captured; 0: unknown.
         size_bytes: Length of the datum's body: arrays, texts and bytes over 256 B, long lists; 0

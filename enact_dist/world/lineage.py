@@ -61,7 +61,10 @@ class Made:
 
     Attributes:
         world: Name of its world context.
+        entity: Its entity.
         aspect: Name of its aspect.
+        version: Its number.
+        position: Position of its commit.
         age_s: How long ago that was, by the shards' clock.
         kind: "commit" or "fork"; otherwise why its cause is not known: "forgotten" (the version
             has left its retention), "unknown" (the version is there, its cause is not) or "null"

@@ -40,6 +40,7 @@ class AspectInfo:
     """One aspect, as some shards know it in the same way.
 
     Attributes:
+        aspect: Its name.
         type: The fingerprint of its type; "" if there are slots but no type is registered.  A ``=``
             marks fields that have a default.
         durability: What its data survive; "" if no type is registered.
@@ -245,6 +246,7 @@ class RefusalInfo:
     """A right that a client of a shard lacked.
 
     Attributes:
+        shard: The shard that refused.
         identity: Whose rights the requests used; "-" for clients whose names are not proven.
         right: The right that was missing; "write" if any of its parts would have sufficed.
         what: On what, as rules in `cell.toml` name it, such as "online:plan/*/joints".
