@@ -54,6 +54,56 @@ def test_file_that_its_client_fills_does_not_come_again_empty(folder, took_back)
     assert asked(desk, "ann-3", ahead=0) == Staged("ann-3", 0, True), "its client may ask for it"
 
 
+class AskedFor:
+    """A lock that says when somebody waits for it."""
+
+    def __init__(self):
+        self.lock, self.waited = threading.Lock(), threading.Event()
+        self.acquire, self.release = self.lock.acquire, self.lock.release
+
+    def __enter__(self):
+        self.waited.set()
+        self.lock.acquire()
+
+    def __exit__(self, *_):
+        self.lock.release()
+
+
+def test_file_is_adopted_that_its_client_found_before_the_desk_knew_it(folder, monkeypatch):
+    """A file has a name as soon as it is made, and a client of another process may be quick."""
+    desk, made, go_on, shown = (
+        PayloadDesk(folder, 60 * SIZE),
+        threading.Event(),
+        threading.Event(),
+        [],
+    )
+    desk.stage(Stage("ann", "ann-1", 0, SIZE, NOTHING, ahead=1))
+    desk._opening = (opening,) = (AskedFor(),)
+    make = payload_files.PayloadFiles.make
+
+    def slowly(*arguments):
+        memory = make(*arguments)
+        made.set()
+        assert go_on.wait(30)
+        return memory
+
+    monkeypatch.setattr(payload_files.PayloadFiles, "make", slowly)
+    maker = threading.Thread(target=desk.make_ahead)
+    maker.start()
+    assert made.wait(30)
+    with (folder.path / "ann-2").open("r+b") as opened:
+        opened.write(b"x" * SIZE)
+    client = threading.Thread(target=lambda: shown.append(committed(desk, 2)))
+    client.start()
+    assert opening.waited.wait(30)
+    go_on.set()
+    client.join(30)
+    maker.join(30)
+
+    assert bytes(shown[0].body) == b"x" * SIZE
+    assert "payloads_missing" not in desk.figures()
+
+
 def test_files_end_with_their_row(folder):
     """Behind it are the payloads of another length, which would find files of the wrong one."""
     desk = PayloadDesk(folder, 60 * SIZE)
@@ -123,18 +173,20 @@ def test_client_that_waits_for_room_holds_up_no_files_of_another(folder):
         assert go_on.wait(30)
 
     desk = PayloadDesk(folder, 20 * SIZE, make_room=make_room)
+    pairs = ((f"ann-{number:x}", f"ann-{number + 1:x}") for number in range(1, 1000))
+    first, behind = next(pair for pair in pairs if (hash(pair[0]) - hash(pair[1])) % 16)
     numbers = (f"eve-{number:x}" for number in range(1, 1000))
-    slow = next(name for name in numbers if (hash(name) - hash("ann-2")) % 16 == 0)
+    slow = next(name for name in numbers if (hash(name) - hash(behind)) % 16 == 0)
     waiter = threading.Thread(target=asked, args=(desk, slow, 0, 21 * SIZE))
     waiter.start()
     assert waits.wait(30)
-    asked(desk, "ann-1", ahead=1)
-    assert not (folder.path / "ann-2").exists()
+    asked(desk, first, ahead=1)
+    assert not (folder.path / behind).exists()
     go_on.set()
     waiter.join()
 
-    asked(desk, "ann-1", ahead=2)
-    assert (folder.path / "ann-2").exists()
+    asked(desk, first, ahead=2)
+    assert (folder.path / behind).exists()
 
 
 def test_file_that_is_given_up_is_followed_by_another(folder):

@@ -28,9 +28,11 @@ def file():
         yield opened
 
 
-def maps():
-    """Return how many maps of deleted files this process has (those of the fixture above)."""
-    return Path("/proc/self/maps").read_text().count("(deleted)")
+def maps(file):
+    """Return how many maps of a file this process has."""
+    inode = str(os.fstat(file.fileno()).st_ino)
+    lines = Path("/proc/self/maps").read_text().splitlines()
+    return sum(line.split()[4] == inode for line in lines)
 
 
 def descriptors():
@@ -45,18 +47,18 @@ def test_map_lasts_as_long_as_a_view_of_it(file, size):
     os.pwrite(file.fileno(), b"x", size - 1)
     gc.collect()  # what earlier tests have left
     assert leftovers().wait(30.0)
-    before, ended = maps(), []
+    before, ended = maps(file), []
     opened = descriptors()
 
     body = body_of(map_file(file.fileno(), size, writable=False, ended=lambda: ended.append(1)))
     last = np.frombuffer(body.toreadonly(), np.uint8)[-1:]
     del body
-    assert (last[0], maps(), ended) == (ord("x"), before + 1, [])
+    assert (last[0], maps(file), ended) == (ord("x"), before + 1, [])
     assert descriptors() == opened
     del last
     gc.collect()
     assert leftovers().wait(30.0)
-    assert (maps(), ended) == (before, [1])
+    assert (maps(file), ended) == (before, [1])
 
 
 def test_map_for_reading_cannot_be_written(file):

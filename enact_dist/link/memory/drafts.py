@@ -11,7 +11,7 @@ from enact_dist.core.protocol.messages import Refused
 from enact_dist.wire.limits import PAYLOAD_BYTES_MIN
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from enact_dist.core.protocol.messages import Commit, Prepare
     from enact_dist.link.memory.maps import Pages, PlainMemory
@@ -79,6 +79,27 @@ def unused(drafts: Mapping[str, Drafted], missing: int) -> list[str]:
             missing -= draft.size
             found.append(file)
     return found
+
+
+def given_up(
+    drafts: Mapping[str, Drafted],
+    lives: Callable[[str], bool],
+    works: Callable[[str], bool],
+    late_ns: int,
+) -> list[str]:
+    """Return the drafts of sessions that have ended, and those untouched for long without a lock.
+
+    Args:
+        drafts: All drafts.
+        lives: Whether a session is known.
+        works: Whether a session holds a lock.
+        late_ns: Drafts touched before this are untouched for long.
+    """
+    return [
+        file
+        for file, one in drafts.items()
+        if not lives(one.session) or (one.touched_ns < late_ns and not works(one.session))
+    ]
 
 
 def beyond_share(

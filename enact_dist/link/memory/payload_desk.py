@@ -40,6 +40,7 @@ from enact_dist.link.memory.drafts import (
     NO_ROOM,
     Drafted,
     beyond_share,
+    given_up,
     names_payloads,
     no_room,
     plain_bytes,
@@ -416,6 +417,9 @@ class PayloadDesk:
 
     def _adopt(self, file: str, size: int) -> Pages | PlainMemory | None:
         """Return the bytes of a complete payload and adopt it; None if there is none."""
+        if file not in self._drafts and file not in self._adopted:
+            with self._opening[hash(file) % len(self._opening)]:
+                pass  # its client may have found a file ahead that is not yet a draft here
         with self._mutex:
             known = self._adopted.get(file)
             if known is not None:
@@ -463,13 +467,7 @@ class PayloadDesk:
             return
         late_ns = self._clock.monotonic_ns() - DRAFT_NS
         with self._mutex:
-            over = [
-                file
-                for file, draft in self._drafts.items()
-                if not lives(draft.session)
-                or (draft.touched_ns < late_ns and not works(draft.session))
-            ]
-            gone = self._remove(over)
+            gone = self._remove(given_up(self._drafts, lives, works, late_ns))
         if gone:  # freed once others may go on
             self._count("drafts_swept", sum(draft.asked for draft in gone))
 
