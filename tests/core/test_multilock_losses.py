@@ -240,6 +240,27 @@ class TestRestart:
 
         assert lock.phase is (Phase.LOST if configured == "os" else Phase.UNKNOWN)
 
+    def test_commit_that_a_restarted_shard_refuses_may_have_come_before(self, cell):
+        """Its copy was applied in the epoch before, and the answer to that was lost."""
+        shard = cell.shards["s0"]
+        ann = cell.client("ann")
+        ann.call("s0", Register("ann", (), (AspectEntry("late", "int", "volatile"),)))
+        lock = ann.locked(item(W, aspect="late"))
+
+        def copy(_shard: str, request: object) -> str:
+            if isinstance(request, Commit) and shard.value(slot(aspect="late")) is None:
+                shard.ask(request)
+                assert shard.value(slot(aspect="late")) is not None
+                shard.restart()
+            return NOTHING
+
+        ann.lose = copy
+        ann.finish(lock, (slot(aspect="late"), "1"))
+
+        assert lock.phase is Phase.UNKNOWN
+        assert lock.finishing is not None
+        assert lock.finishing.known_in
+
     def test_shard_that_lost_its_folder_knows_nothing_of_a_commit(self, cell):
         """Its record went with the folder: nothing says whether others have read the data."""
         shard = cell.shards["s0"]

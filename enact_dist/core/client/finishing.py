@@ -58,7 +58,6 @@ class Finishing:
         reads_left_out: How many data more than these were read.
         prepared: What the other writing shards have answered.
         pending: Whether the last word about the commit was that its shard still works on it.
-        unanswered: Whether a copy of the commit got no answer, so it may have taken effect.
         recorded: The aspects whose commits the primary still knows after a restart.
         known_in: Once it has ended: the epoch of the primary that alone can know whether the commit
             that was sent took effect; 0: later ones can, too.
@@ -76,7 +75,6 @@ class Finishing:
     ask_outcome: bool = False
     sent: bool = False
     pending: bool = False
-    unanswered: bool = False
     recorded: frozenset[str] = frozenset()
     known_in: int = 0
 
@@ -129,10 +127,9 @@ class Finishing:
             keeping.used_ns(now_ns) if keeping is not None else 0,
         )
 
-    def silent(self, request: Request) -> None:
+    def silent(self) -> None:
         """The primary did not answer: ask for the outcome before anything is sent again."""
         self.ask_outcome, self.pending = True, False
-        self.unanswered |= isinstance(request, Commit)
 
     def _known_in(self) -> int:
         epoch = self.token.epoch
@@ -156,7 +153,8 @@ class Finishing:
         if answer.kind == OUTCOME_EXPIRED:
             return Phase.UNKNOWN, "its shard has no record of this session any more"
         if not self.pending and answer.epoch != self.token.epoch:
-            if self.unanswered and (self._known_in() or not is_kept(answer.epoch)):
+            # Even if the shard refused this copy: an earlier one may have come before the restart.
+            if self._known_in() or not is_kept(answer.epoch):
                 return (
                     Phase.UNKNOWN,
                     f"{SHARD_RESTARTED}, which lost its record of the commit, if there was one",

@@ -223,7 +223,7 @@ class MultiLock:
         self.silent_shard = shard
         self._free_calls = 0
         if isinstance(request, _DECIDERS) and self.finishing is not None:
-            self.finishing.silent(request)
+            self.finishing.silent()
         self._pause(now_ns)
 
     def _pause(self, now_ns: int) -> None:
