@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from enact_dist.config.shows import Shows
-    from enact_dist.core.protocol.datum import Slot
+    from enact_dist.core.protocol.datum import Datum, Slot
     from enact_dist.recording.exact import Recorded
     from enact_dist.recording.reading import RecordedCommit
     from enact_dist.view.source import Histories
@@ -40,6 +40,7 @@ class RecordingSource:
         name: Of the file.
         timeline: All its moments.
         catalogue: All its slots, as they are at its end.
+        sizes: The bytes of the newest version of each.
 
     Raises:
         ConfigError: The file cannot be read, or is no recording of this project.
@@ -51,11 +52,13 @@ class RecordingSource:
         self.name = self._recording.path.name
         self._lineage = RecordedLineage(self._recording.path)
         self.catalogue = SlotCatalogue()
+        self.sizes: dict[Slot, int] = {}
         stamps: set[int] = set()
         for commit in self._recording.commits():
             for one in commit.versions:
                 state = ListedState(one.version, one.stamp_ns, one.datum is None, one.captured_ns)
                 self.catalogue.note(one.slot, state, gap=0, now_s=one.stamp_ns / 1e9)
+                self.sizes[one.slot] = one.size
                 stamps.add(self._moment(commit))
         ordered = tuple(sorted(stamps))
         begin_ns = ordered[0] if ordered else 0
@@ -111,6 +114,25 @@ class RecordingSource:
     def histories(self, slots: Sequence[Slot]) -> Histories:
         """Return every moment of the recording as if each of these slots had it."""
         return {slot: list(enumerate(self.timeline.stamps_ns, 1)) for slot in slots}
+
+    def samples(self, slot: Slot, most: int) -> list[tuple[int, Datum]]:
+        """Return stamps and data of a slot, spread over the recording; the file is read once more.
+
+        Raises:
+            ProtocolError: The recording holds what this version cannot read.
+        """
+        found: list[tuple[int, Datum]] = []
+        seen, every = 0, 1
+        for commit in Recording(self._recording.path).commits():
+            for one in commit.versions:
+                if one.slot != slot or one.datum is None:
+                    continue
+                if seen % every == 0:
+                    found.append((one.stamp_ns, one.datum))
+                seen += 1
+                if len(found) > most:
+                    found, every = found[::2], 2 * every
+        return found
 
     def tree_of(self, way: str, recorded: Recorded, depth: int) -> CauseTree | EffectTree:
         """Return the causes (``why``) or the effects (``impact``) of a version.

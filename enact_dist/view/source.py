@@ -27,10 +27,12 @@ from enact_dist.errors import (
 from enact_dist.link.client.calls import CALL_S
 from enact_dist.recording.exact import Recorded
 from enact_dist.terms import Access
+from enact_dist.world.version_data import Wanted, found_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
+    from enact_dist.core.protocol.datum import Datum
     from enact_dist.core.protocol.messages import VersionEntry
     from enact_dist.world.cell import Cell
     from enact_dist.world.lineage import CauseTree, EffectTree
@@ -79,6 +81,9 @@ class DataSource(Protocol):
 
     def histories(self, slots: Sequence[Slot]) -> Histories:
         """Return which versions of these slots are known."""
+
+    def samples(self, slot: Slot, most: int) -> list[tuple[int, Datum]]:
+        """Return stamps and data of some versions of a slot that are no nulls, in their order."""
 
     def tree_of(self, way: str, recorded: Recorded, depth: int) -> CauseTree | EffectTree:
         """Return the causes (``why``) or the effects (``impact``) of a version."""
@@ -266,6 +271,18 @@ class CellSource:
                 if state.slot in wanted and state.version:
                     found.setdefault(state.slot, []).append((state.version, state.stamp_ns))
         return {slot: sorted(each, key=lambda one: one[1]) for slot, each in found.items()}
+
+    def samples(self, slot: Slot, most: int) -> list[tuple[int, Datum]]:
+        """Return stamps and data of the newest versions of a slot, as far as they are kept.
+
+        Raises:
+            ShardUnreachableError: Its shard does not answer.
+        """
+        shard, versions = self.shard_of(slot), self.histories([slot]).get(slot, [])[-most:]
+        wanted = [Wanted(stamp_ns, slot, version, shard) for version, stamp_ns in versions]
+        found = found_of(self.session, wanted)
+        data = [(one.stamp_ns, found[one].datum) for one in wanted if one in found]
+        return [(stamp_ns, datum) for stamp_ns, datum in data if datum is not None]
 
     def explained(self, versions: Mapping[Slot, int]) -> dict[Slot, VersionEntry]:
         """Return size and writer of a version of each of some slots whose shards answer."""

@@ -12,6 +12,7 @@ from enact_dist.recording.recorder import Recorder
 from enact_dist.view.pages.page import Page
 from enact_dist.view.pages.viewer import Viewer, ViewSettings
 from enact_dist.view.recorded import RecordingSource
+from enact_dist.wire.payload import decode_untyped
 
 REPORT = Aspect("report", str)
 CELL = Entity("system")
@@ -28,8 +29,8 @@ def report_on(cell, text):
         lock[report] = f"{text}: {lock[pose][0, 3]} at {lock[speed]}"
 
 
-def recorded(cell, path, **options):
-    """Record a pose made of a speed, and two reports made of that pose."""
+def recorded(cell, path, *, more=lambda: None, **options):
+    """Record a pose made of a speed, two reports made of that pose, and more."""
     online = cell.world("online")
     cell.world("truth").init(ARM, SPEED, 0.25)
     recorder, stop, begun = Recorder(cell, path, **options), threading.Event(), threading.Event()
@@ -42,6 +43,7 @@ def recorded(cell, path, **options):
             lock[pose] = moved(lock[speed])
         report_on(cell, "first")
         report_on(cell, "second")
+        more()
     finally:
         stop.set()
         thread.join(60)
@@ -105,6 +107,39 @@ def test_a_page_shows_the_tree_and_goes_to_its_steps(cell, tmp_path):
         until(lambda: any("truth:arm/speed" in str(h.content) for h in [*handles.values()]))
         page.close()
         page._thread.join()
+
+
+def test_rows_of_a_recording_are_as_of_its_moment(cell, tmp_path):
+    """Value, version and writer; a chosen datum has its numbers of the whole recording."""
+    speed = Write(cell.world("online"), ARM, SPEED)
+
+    def speed_up():
+        for number in range(1, 21):
+            with Lock(speed) as lock:
+                lock[speed] = 0.5 + number
+
+    source = recorded(cell, tmp_path / "run.mcap", more=speed_up)
+    with Viewer(source, ViewSettings(SHOWS, "online")) as viewer:
+        page = Page(viewer, QuietClient())
+        page.start()
+        handles = page._client.gui.handles
+
+        def row(*wanted):
+            texts = [str(handle.content) for handle in [*handles.values()]]
+            return any(all(one in text for one in wanted) for text in texts)
+
+        page._send("seconds", source.timeline.span_s)
+        until(lambda: row("<b>arm/speed</b> 20.5", "v21", "by writer"))
+        page._send("step", -1)
+        until(lambda: row("<b>arm/speed</b> 19.5", "v20"))
+        page._send("datum", "arm/speed")
+        until(lambda: row("<b>online:arm/speed</b>", "19.5", "<svg"))
+        page.close()
+        page._thread.join()
+    slot = next(s for s in source.catalogue.slots("online") if s.aspect == "speed")
+    assert len(source.samples(slot, 100)) == 21
+    spread = [decode_untyped(datum) for _, datum in source.samples(slot, 6)]
+    assert spread == [0.5 + number for number in range(0, 21, 4)]
 
 
 def test_a_recording_of_before_has_no_causes_and_names_its_writers():

@@ -11,7 +11,6 @@ from enact_dist.errors import ConfigError, EnactError, MisuseError
 from enact_dist.view import markup
 from enact_dist.view.drawing.files import ply_of, png_of
 from enact_dist.wire.payload import decode_untyped
-from enact_dist.world.version_data import Wanted, found_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -60,21 +59,17 @@ class Samples:
         for slot in self._known.keys() - slots:
             del self._known[slot]
 
-    def learn(self, source: CellSource, slot: Slot) -> None:
+    def learn(self, source: DataSource, slot: Slot) -> None:
         """Take the history of a slot.
 
         Raises:
-            ShardUnreachableError: Its shard does not answer.
+            EnactError: Its shard does not answer, or the recording cannot be read.
         """
-        shard = source.session.client.shard_of(slot.entity)
-        versions = source.histories([slot]).get(slot, [])[-markup.SAMPLES_MAX :]
-        wanted = [Wanted(stamp, slot, version, shard) for version, stamp in versions]
-        found = found_of(source.session, wanted)
+        learned = source.samples(slot, markup.SAMPLES_MAX)
         newer = list(self._known.pop(slot, ()))
-        for each in wanted:
-            datum = found[each].datum if each in found else None
-            if datum is not None and datum.size <= SMALL_BYTES:
-                self._add(slot, each.stamp_ns, decode_untyped(datum))
+        for stamp_ns, datum in learned:
+            if datum.size <= SMALL_BYTES:
+                self._add(slot, stamp_ns, decode_untyped(datum))
         known = self._known.setdefault(slot, deque(maxlen=markup.SAMPLES_MAX))
         known.extend(one for one in newer if not known or one[0] > known[-1][0])
 

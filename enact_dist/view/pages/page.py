@@ -168,7 +168,7 @@ class Page:
         self._viewer.feed.wish(self, wanted if player.live else ())
         data = contents.data(wanted)
         for slot in rows:
-            if player.live and slot in data:
+            if slot in data and (player.live or self._viewer.cell is None):
                 self._samples.add(data[slot])
         shown = {slot: data[slot] for slot in (*drawn, *labelled) if slot in data}
         whole = len(shown) >= len(drawn) or now_s > self._begun_s + FITTED_S
@@ -237,19 +237,18 @@ class Page:
 
     def _followed(self) -> list[Slot]:
         """Return the listed data whose values are shown: small ones, and the chosen datum."""
-        followed = []
-        for slot in self._rows():
-            entry = self._viewer.entry(slot)
-            if slot == self._datum or (entry is not None and entry.state.size <= SMALL_BYTES):
-                followed.append(slot)
-        return followed
+        return [slot for slot in self._rows() if slot == self._datum or self._is_small(slot)]
+
+    def _is_small(self, slot: Slot) -> bool:
+        size = self._viewer.size(slot)
+        return size is not None and size <= SMALL_BYTES
 
     def _show_panels(self, data: Mapping[Slot, ShownDatum]) -> None:
         contents, player, listing = self.contents, self.contents.player, self._listing
         assert listing is not None
-        below = "" if self._filter else self._path
+        below, past_ns = "" if self._filter else self._path, 0 if player.live else player.at_ns
         rows = [
-            texts.row_of(self._viewer, self._samples, slot, data.get(slot), below=below)
+            texts.row_of(self._viewer, self._samples, slot, data.get(slot), below, past_ns)
             for slot in listing.slots
         ]
         more = (
@@ -314,15 +313,11 @@ class Page:
     def _on_datum(self, name: str) -> None:
         found = [slot for slot in self._rows() if markup.slot_name(slot) == name]
         self._datum = found[0] if found else None
-        source = self._viewer.cell
-        if self._datum is not None and source is not None:
-            entry = self._viewer.entry(self._datum)
-            if entry is not None and entry.state.size <= SMALL_BYTES:
-                self._send("history", self._datum)  # after the datum itself is shown
+        if self._datum is not None and self._is_small(self._datum):
+            self._send("history", self._datum)  # after the datum itself is shown
 
     def _on_history(self, slot: Slot) -> None:
-        if self._viewer.cell is not None:
-            self._samples.learn(self._viewer.cell, slot)
+        self._samples.learn(self._viewer.source, slot)
 
     def _on_layer(self, box: tuple[str, bool]) -> None:
         aspect, is_on = box

@@ -5,11 +5,14 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING
 
+from enact_dist.recording.exact import Recorded
 from enact_dist.view import markup
 from enact_dist.world.trees import shown_s
 
 if TYPE_CHECKING:
     from enact_dist.core.protocol.datum import Slot
+    from enact_dist.core.protocol.messages import VersionEntry
+    from enact_dist.view.catalogue import ListedState
     from enact_dist.view.drawing.scene import ShownDatum
     from enact_dist.view.pages.contents import PageContents
     from enact_dist.view.pages.datum import Samples
@@ -17,7 +20,12 @@ if TYPE_CHECKING:
 
 
 def row_of(
-    viewer: Viewer, samples: Samples, slot: Slot, shown: ShownDatum | None, *, below: str
+    viewer: Viewer,
+    samples: Samples,
+    slot: Slot,
+    shown: ShownDatum | None,
+    below: str,
+    past_ns: int,
 ) -> str:
     """Return a listed datum as HTML.
 
@@ -27,25 +35,39 @@ def row_of(
         slot: Its slot.
         shown: Its value, None if that has not come.
         below: The path that its name is shown without.
+        past_ns: As of which moment; 0: the present.
     """
     catalogue, now_s = viewer.feed.catalogue, time.monotonic()
-    entry, state = viewer.entry(slot), catalogue.state(slot)
+    entry, size = viewer.entry(slot), viewer.size(slot)
+    state: ListedState | Recorded | None = catalogue.state(slot)
+    if past_ns:
+        state = shown.recorded if shown is not None else None
     name = markup.slot_name(slot).removeprefix(below)
     value = markup.text(markup.short_value(shown.value)) if shown is not None else ""
-    line = f"<b>{markup.text(name)}</b> {value} {markup.plot(samples.of(slot))}"
+    line = f"<b>{markup.text(name)}</b> {value} {markup.plot(samples.of(slot, past_ns))}"
     facts = [viewer.type_of(slot.aspect)]
-    if entry is not None:
-        facts.append(markup.size(entry.state.size))
+    if size is not None:
+        facts.append(markup.size(size))
     rate_hz = catalogue.rate_hz(slot, now_s)
     facts.append(f"{rate_hz:.3g} Hz" if rate_hz is not None else "")
     if state is not None:
-        facts += [f"v{state.version}", markup.age(time.time_ns(), state.stamp_ns)]
-    if entry is not None and entry.cause is not None:
-        facts.append(f"by {entry.cause.actor or '(unnamed)'}")
+        facts += [f"v{state.version}", markup.age(past_ns or time.time_ns(), state.stamp_ns)]
+    by = _writer_of(entry, state)
+    if by is not None:
+        facts.append(f"by {by or '(unnamed)'}")
     held = viewer.activity_now().held.get(str(slot), "")
     facts += [f"lock: {held}"] if held else []
     under = markup.text(" · ".join(filter(None, facts)))
     return f'<div style="margin-bottom:3px">{line}<div style="color:#888">{under}</div></div>'
+
+
+def _writer_of(entry: VersionEntry | None, state: ListedState | Recorded | None) -> str | None:
+    """Return who wrote a version, None if that is not known of this one."""
+    if isinstance(state, Recorded) and state.actor:
+        return state.actor
+    if entry is None or entry.cause is None or state is None:
+        return None
+    return entry.cause.actor if entry.state.version == state.version else None
 
 
 def datum_of(
