@@ -160,6 +160,12 @@ class ShownTrajectory(NamedTuple):
     places_m: NDArray[np.float64]
 
 
+class ShownJointPath(NamedTuple):
+    """A path of an arm's joints: (N, J) floats, rad, those rows alone that are finite."""
+
+    positions_rad: NDArray[np.float64]
+
+
 class ShownTransform(NamedTuple):
     """Where a frame is in its parent: (4, 4) rigid, metres."""
 
@@ -197,6 +203,7 @@ Drawable = (
     | ShownJoints
     | ShownPose
     | ShownTrajectory
+    | ShownJointPath
     | ShownTransform
     | ShownCamera
     | ShownPlain
@@ -307,7 +314,13 @@ def _pose(part: object, _: Shows) -> ShownPose | None:
     return ShownPose(matrix) if matrix is not None else None
 
 
-def _trajectory(part: object, _: Shows) -> ShownTrajectory | None:
+def _trajectory(part: object, shows: Shows) -> ShownTrajectory | ShownJointPath | None:
+    if shows.model:
+        found = (array for array, _ in arrays_of(part) if array.ndim == 2)
+        rows = next((array for array in found if array.dtype.kind == "f"), None)
+        if rows is None:
+            return None
+        return ShownJointPath(rows[np.isfinite(rows).all(axis=1)].astype(np.float64))
     for array, _beside in _named_first(part, "points_m"):
         places_m = path_of(array)
         if places_m is not None:

@@ -29,6 +29,7 @@ from enact_dist.recording.drawing.drawables import (
     ShownCapsules,
     ShownCloud,
     ShownImage,
+    ShownJointPath,
     ShownJoints,
     ShownMesh,
     ShownPlain,
@@ -370,6 +371,7 @@ _MESSAGES: Final = {
     ShownJoints: _joints,
     ShownPose: _pose,
     ShownTrajectory: _trajectory,
+    ShownJointPath: lambda *_: None,  # as a line it needs the model of its arm
     ShownTransform: _transform,
     ShownCamera: _calibration,
     ShownPlain: _as_json,

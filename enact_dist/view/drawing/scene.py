@@ -14,6 +14,7 @@ from enact_dist.recording.drawing.drawables import (
     ShownCapsules,
     ShownCloud,
     ShownImage,
+    ShownJointPath,
     ShownJoints,
     ShownMesh,
     ShownPose,
@@ -23,7 +24,7 @@ from enact_dist.recording.drawing.drawables import (
     drawables_of,
 )
 from enact_dist.recording.drawing.solids import outer_voxels
-from enact_dist.view.drawing.arms import arm_capsules
+from enact_dist.view.drawing.arms import arm_capsules, arm_path
 from enact_dist.view.drawing.frames import InParent, placed
 from enact_dist.view.drawing.nodes import (
     AxesNode,
@@ -152,7 +153,7 @@ def scene_of(
         tint = tints.get(slot)
         for kind, drawable in shown.drawables.items():
             made = _made(shown, kind, drawable, tint)
-            if isinstance(drawable, ShownJoints):
+            if isinstance(drawable, ShownJoints | ShownJointPath):
                 model = data.get(slot._replace(aspect=shown.shows.model))
                 try:
                     made = _arm(shown, drawable, model, tint)
@@ -224,19 +225,27 @@ def _node(frame: str, drawable: Drawable | None, tint: Colour | None) -> Node | 
         return CapsulesNode(frame, drawable.capsules, tint or CAPSULE_COLOUR)
     if isinstance(drawable, ShownPose):
         return AxesNode(frame, drawable.matrix, tint)
-    if isinstance(drawable, ShownTrajectory) and len(drawable.places_m) > 1:
-        places_m = drawable.places_m
-        step = -(-len(places_m) // PLACES_MAX)
-        with np.errstate(over="ignore"):
-            kept = np.concatenate((places_m[:-1:step], places_m[-1:])).astype(np.float32)
-        return LineNode(frame, kept, tint or PATH_COLOUR) if np.isfinite(kept).all() else None
+    if isinstance(drawable, ShownTrajectory):
+        return _path(frame, drawable.places_m, tint)
     return None
 
 
+def _path(frame: str, places_m: NDArray[np.float64], tint: Colour | None) -> LineNode | None:
+    if len(places_m) < 2:
+        return None
+    step = -(-len(places_m) // PLACES_MAX)
+    with np.errstate(over="ignore"):
+        kept = np.concatenate((places_m[:-1:step], places_m[-1:])).astype(np.float32)
+    return LineNode(frame, kept, tint or PATH_COLOUR) if np.isfinite(kept).all() else None
+
+
 def _arm(
-    shown: ShownDatum, joints: ShownJoints, model: ShownDatum | None, tint: Colour | None
+    shown: ShownDatum,
+    joints: ShownJoints | ShownJointPath,
+    model: ShownDatum | None,
+    tint: Colour | None,
 ) -> Node | None:
-    """Return an arm at the positions of its joints; None without a model that fits.
+    """Return an arm at the positions of its joints, or its path; None without a model that fits.
 
     Raises:
         ConfigError: Its file cannot be drawn, or has other joints.
@@ -249,15 +258,28 @@ def _arm(
     known = shown.made.get(key)
     if known is None:
         _forget_older(shown.made, "arm")
-        node: Node | None = None
-        if isinstance(described, Robot):
-            poses = described.poses(joints, named=bool(shown.shows.joints))
-            node = RobotNode(shown.frame, described.shapes, poses, tint) if len(poses) else None
-        elif capsules := arm_capsules(described.value, joints.positions):
-            node = CapsulesNode(shown.frame, capsules, tint or ARM_COLOUR)
+        node = _arm_node(shown, joints, described, tint)
         known = shown.made[key] = node, described  # referenced, so that its id stays its own
     arm: Node | None = known[0]
     return arm
+
+
+def _arm_node(
+    shown: ShownDatum,
+    joints: ShownJoints | ShownJointPath,
+    described: Robot | ShownDatum,
+    tint: Colour | None,
+) -> Node | None:
+    if isinstance(described, ShownDatum):
+        if isinstance(joints, ShownJointPath):
+            places_m = arm_path(described.value, joints.positions_rad)
+            return _path(shown.frame, places_m, tint) if places_m is not None else None
+        capsules = arm_capsules(described.value, joints.positions)
+        return CapsulesNode(shown.frame, capsules, tint or ARM_COLOUR) if capsules else None
+    if isinstance(joints, ShownJointPath):
+        return None  # `Shows` gives a robot of a file no model, and so no path of joints
+    poses = described.poses(joints, named=bool(shown.shows.joints))
+    return RobotNode(shown.frame, described.shapes, poses, tint) if len(poses) else None
 
 
 def _stride(count: int) -> int:
