@@ -47,6 +47,9 @@ from enact_dist.terms import NullReason
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from enact_dist.core.protocol.messages import VersionEntry
+    from enact_dist.world.version_data import Retained, Wanted
+
 FORMAT: Final = 2
 FORMATS: Final = (1, 2)
 """Formats that are read."""
@@ -124,6 +127,27 @@ class Recorded:
         """Return about how many bytes it takes."""
         datum_bytes = self.datum.size + len(self.datum.encoding) if self.datum else 0
         return 256 + READ_BYTES * len(self.reads) + datum_bytes
+
+
+def recorded_of(
+    wanted: Wanted, entry: VersionEntry | None, found: Retained, commit: int
+) -> Recorded:
+    """Return a version for a recording.
+
+    Args:
+        wanted: Which it is.
+        entry: What its shard knows of it; None: nothing any more.
+        found: What it is.
+        commit: Number of its commit in the recording.
+    """
+    facts = (wanted.slot, wanted.version, wanted.stamp_ns, wanted.shard, commit)
+    cause = entry.cause if entry is not None else None
+    if cause is None:
+        return Recorded(*facts, found.datum, found.null_reason)
+    return Recorded(
+        *facts, found.datum, found.null_reason, cause.actor, cause.host, cause.pid, cause.kind,
+        cause.held_ns, cause.reads, cause.reads_left_out,
+    )  # fmt: skip
 
 
 def encode_recorded(recorded: Recorded) -> bytes:

@@ -10,9 +10,10 @@ from enact_dist.access.snapshot import HeldView
 from enact_dist.config.shows import GUESSED
 from enact_dist.core.protocol.messages import Item
 from enact_dist.errors import ConfigError
-from enact_dist.recording.exact import Recorded
+from enact_dist.recording.exact import recorded_of
 from enact_dist.recording.file import RecordingFile
 from enact_dist.terms import Access
+from enact_dist.world.version_data import Retained, Wanted, explained
 
 if TYPE_CHECKING:
     import os
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
     from enact_dist.config.shows import Shows
     from enact_dist.core.client.plan import Reading
+    from enact_dist.recording.exact import Recorded
     from enact_dist.world.context import WorldContext
 
 PORTION_BYTES: Final = 64 << 20
@@ -45,7 +47,7 @@ class ExportSummary:
 
 
 def world_as_of(world: WorldContext, at_ns: int = 0) -> Iterator[Recorded]:
-    """Yield every datum of a world context, all of one moment, over all shards.
+    """Yield every datum of a world context, all of one moment, over all shards, with its cause.
 
     Not more than `PORTION_BYTES` are in memory at once, or the largest datum; the shards keep the
     rest until then.
@@ -68,9 +70,13 @@ def world_as_of(world: WorldContext, at_ns: int = 0) -> Iterator[Recorded]:
         states = [reading for reading in view.states if not reading.state.null_reason]
         for portion in _portions(sorted(states, key=lambda reading: reading.state.slot)):
             data = view.fetch(portion)
+            entries = explained(
+                session, [Wanted(s.stamp_ns, s.slot, s.version, shard) for shard, _, s in portion]
+            )
             for shard, _, state in portion:
-                datum = data.pop(state.slot)
-                yield Recorded(state.slot, state.version, state.stamp_ns, shard, 0, datum)
+                wanted = Wanted(state.stamp_ns, state.slot, state.version, shard)
+                found = Retained("", data.pop(state.slot))
+                yield recorded_of(wanted, entries.get(wanted), found, 0)
 
 
 def _portions(readings: list[Reading]) -> Iterator[list[Reading]]:

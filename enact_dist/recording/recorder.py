@@ -28,7 +28,7 @@ from enact_dist.errors import (
     UnknownWorldError,
 )
 from enact_dist.recording.disk import QUEUE_BYTES_MAX, DiskThread
-from enact_dist.recording.exact import Recorded
+from enact_dist.recording.exact import recorded_of
 from enact_dist.recording.file import CHUNK_BYTES, CHUNK_S, RecordingFile
 from enact_dist.recording.settling import END_S, Settling
 from enact_dist.recording.summary import (
@@ -421,7 +421,7 @@ class Recorder:
         found: Mapping[Wanted, Retained],
     ) -> None:
         self.summary.versions += len(group)
-        versions = tuple(_recorded(w, entries.get(w), found[w], commit) for w in group)
+        versions = tuple(recorded_of(w, entries.get(w), found[w], commit) for w in group)
         self._disk.put(versions, log_ns)
 
     def _finish(self, watch: Watch) -> None:
@@ -471,23 +471,3 @@ def _commits(
             lock = cause.lock if cause is not None and None not in causes else None
             by_lock.setdefault(lock, []).append(wanted)
         yield from by_lock.values()
-
-
-def _recorded(wanted: Wanted, entry: VersionEntry | None, found: Retained, commit: int) -> Recorded:
-    cause = entry.cause if entry is not None else None
-    return Recorded(
-        wanted.slot,
-        wanted.version,
-        wanted.stamp_ns,
-        wanted.shard,
-        commit,
-        found.datum,
-        found.null_reason,
-        cause.actor if cause is not None else "",
-        cause.host if cause is not None else "",
-        cause.pid if cause is not None else 0,
-        cause.kind if cause is not None else "",
-        cause.held_ns if cause is not None else 0,
-        cause.reads if cause is not None else (),
-        cause.reads_left_out if cause is not None else 0,
-    )

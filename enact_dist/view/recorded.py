@@ -58,7 +58,7 @@ class RecordingSource:
             for one in commit.versions:
                 state = ListedState(one.version, one.stamp_ns, one.datum is None, one.captured_ns)
                 self.catalogue.note(one.slot, state, gap=0, now_s=one.stamp_ns / 1e9)
-                self.sizes[one.slot] = one.size
+                self.sizes[one.slot] = one.datum.size if one.datum is not None else 0
                 stamps.add(self._moment(commit))
         ordered = tuple(sorted(stamps))
         begin_ns = ordered[0] if ordered else 0

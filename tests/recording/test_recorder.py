@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from enact_dist import Aspect, Durability, Entity, Lock, Write
+from enact_dist import Aspect, Durability, Entity, Lock, Read, Write
 from enact_dist.access.snapshot import HeldView
 from enact_dist.core.state import history
 from enact_dist.errors import ConfigError, StoreError, UnknownWorldError
@@ -396,6 +396,20 @@ def test_export_is_a_recording_of_one_moment(cell, online, tmp_path):
     assert summary.versions == 2
     Replay(cell, path, worlds={"online": "copy"}).run()
     assert same_data(online, cell.world("copy"))
+
+
+def test_export_names_the_causes_of_its_data(online, tmp_path):
+    """Which process wrote them, and what that lock had read."""
+    put((Write(online, bench, COUNT), 2))
+    count, seen = Write(online, piece, COUNT), Read(online, bench, COUNT)
+    with Lock(count, seen) as lock:
+        lock[count] = lock[seen] + 1
+    export_world(online, tmp_path / "now.mcap")
+    versions = {v.slot.entity: v for c in commits_of(tmp_path / "now.mcap") for v in c.versions}
+    made = versions["piece"]
+    assert (made.kind, made.pid) == ("commit", os.getpid())
+    assert [read.slot.entity for read in made.reads] == ["bench"]
+    assert made.reads[0].stamp_ns == versions["bench"].stamp_ns
 
 
 def test_export_ends_and_leaves_no_file_once_it_is_too_large(online, tmp_path, monkeypatch):

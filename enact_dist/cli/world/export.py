@@ -113,5 +113,6 @@ def _save(version: Recorded, folder: Path) -> dict[str, object]:
         "stamp_ns": version.stamp_ns,
         "captured_ns": version.captured_ns,
         "shard": version.shard,
+        "actor": version.actor,
         "files": [f"{entity}/{aspect}{suffix}" for suffix in suffixes],
     }
