@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import re
 import time
+from collections import deque
 from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 
     from enact_dist.core.protocol.datum import Slot
     from enact_dist.core.protocol.messages import VersionEntry
-    from enact_dist.operate.cell_rows import CellRates
+    from enact_dist.operate.cell_rows import ActorRates, CellRates
     from enact_dist.view.catalogue import SlotCatalogue
     from enact_dist.view.source import CellSource
     from enact_dist.world.listings import LockInfo
@@ -68,6 +69,7 @@ class Activity(Follower):
         self._types: dict[str, str] = {}
         self._listed: dict[object, frozenset[Slot]] = {}
         self._looks = Looks()
+        self._run_times = RunTimes()
 
     def list(self, page: object, slots: Iterable[Slot] | None) -> None:
         """Set which slots a page lists; None: the page has gone."""
@@ -122,7 +124,7 @@ class Activity(Follower):
         rates = self._looks.add(self._source.cell.look())
         self.now = CellActivity(
             table(rates, "l"),
-            table(rates, "a"),
+            table(rates, "a", self._run_times.add(rates.actors)),
             table(rates, "s") + table(rates, "c"),
             held_of(rates.locks),
         )
@@ -151,11 +153,42 @@ def held_of(locks: Iterable[LockInfo]) -> dict[str, str]:
     }
 
 
-def table(rates: CellRates, key: str) -> str:
-    """Return a table of `enact top`, named by its key; without what needs a look at all slots."""
+class RunTimes:
+    """How long the updates of each actor took at the last looks."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[str, ...], deque[tuple[int, dict[str, float]]]] = {}
+
+    def add(self, actors: Iterable[ActorRates]) -> dict[tuple[str, ...], str]:
+        """Take a look; return the strip of each actor (its name, host and process)."""
+        before, self._known = self._known, {}
+        for actor in actors:
+            key = (actor.name, actor.host, str(actor.pid))
+            known = before.get(key, deque(maxlen=markup.SAMPLES_MAX))
+            if actor.runs_hz is not None and actor.update_p50_ms:
+                took_ms = {"p50": actor.update_p50_ms, "p99": actor.update_p99_ms}
+                known.append((time.time_ns(), took_ms))
+            self._known[key] = known
+        return {key: markup.plot([*known]) for key, known in self._known.items()}
+
+
+def table(rates: CellRates, key: str, strips: Mapping[tuple[str, ...], str] | None = None) -> str:
+    """Return a table of `enact top` as HTML, without what needs a look at all slots.
+
+    Args:
+        rates: What two looks have shown.
+        key: Which table.
+        strips: Of actors: their run times, which follow their names.
+    """
     (found,) = (one for one in TABLES if one.key == key)
     lines, count = found.lines(rates, markup.ROWS_SHOWN_MAX)
     names = [column.name for column in found.columns]
     kept = [index for index, name in enumerate(names) if name != "wrote"]
     rows = [[line[index] for index in kept] for line in lines]
-    return markup.table([names[index] for index in kept], rows, empty=found.empty, count=count)
+    shown = [names[index] for index in kept]
+    if strips is not None:
+        places = [shown.index(name) for name in ("actor", "host", "pid")]
+        for row in rows:
+            row.insert(1, markup.Markup(strips.get(tuple(row[place] for place in places), "")))
+        shown.insert(1, "run time")
+    return markup.table(shown, rows, empty=found.empty, count=count)

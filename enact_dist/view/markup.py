@@ -35,6 +35,12 @@ _PLOT_COLOURS: Final = (
 )  # fmt: skip
 
 
+class Markup(str):
+    """Markup that was made here, which a table takes as it is."""
+
+    __slots__ = ()
+
+
 def text(value: object) -> str:
     """Return a text that no name or datum can turn into markup."""
     return escape(visible(str(value)))
@@ -50,14 +56,17 @@ def table(
     columns: Sequence[str], rows: Iterable[Sequence[object]], *, empty: str, count: int = 0
 ) -> str:
     """Return a table, or the sentence `empty` without any row; `count`: of all rows, if more."""
-    lines_ = [
-        "<tr>" + "".join(f'<td style="padding:1px 6px">{text(cell)}</td>' for cell in row) + "</tr>"
-        for row in rows
-    ]
+
+    def column(cell: object) -> str:
+        content = cell if isinstance(cell, Markup) else text(cell)
+        return f'<td style="padding:1px 6px;white-space:nowrap">{content}</td>'
+
+    lines_ = ["<tr>" + "".join(map(column, row)) + "</tr>" for row in rows]
     if not lines_:
         return small(f"<i>{text(empty)}</i>")
     head = "".join(
-        f'<th style="padding:1px 6px;text-align:left">{text(one)}</th>' for one in columns
+        f'<th style="padding:1px 6px;white-space:nowrap;text-align:left">{text(one)}</th>'
+        for one in columns
     )
     more = max(count, len(lines_)) - ROWS_SHOWN_MAX
     left = f"<div>… and {more} more</div>" if more > 0 else ""

@@ -1,12 +1,15 @@
 """What pages list: moments, slots, numbers, and texts that cannot become markup."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from view_samples import BEGIN_NS, SECOND_NS, slot
 
+from enact_dist.operate.cell_rows import ActorRates
 from enact_dist.view import markup
+from enact_dist.view.activity import RunTimes, table
 from enact_dist.view.catalogue import ROWS_MAX, ListedState, SlotCatalogue
 from enact_dist.view.timeline import Player, Timeline
 
@@ -132,6 +135,23 @@ def test_texts_of_the_cell_are_no_markup():
         markup.big_plot([(1, {evil: 1.0}), (2, {evil: 2.0})]),
     ):
         assert "<img" not in content
+
+
+def test_each_actor_has_a_strip_of_its_own_run_times():
+    """One that says nothing, or that has gone, has none; its name stays a text."""
+    times = RunTimes()
+    for p50_ms in (2.0, 4.0):
+        planner = ActorRates("<b>plan", "pc", 7, "running", 10.0, p50_ms, 2 * p50_ms)
+        twin = ActorRates("<b>plan", "pc", 8, "connected")
+        strips = times.add([planner, twin])
+    rows = table(SimpleNamespace(actors=[planner, twin]), "a", strips).split("<tr>")
+    assert "<th" in rows[1]
+    assert rows[1].index(">actor<") < rows[1].index(">run time<") < rows[1].index(">state<")
+    drawn = next(row for row in rows[2:] if ">7<" in row)
+    silent = next(row for row in rows[2:] if ">8<" in row)
+    assert (drawn.count("<polyline"), silent.count("<svg")) == (2, 0)
+    assert "&lt;b&gt;plan" in drawn
+    assert times.add([twin]).keys() == {("<b>plan", "pc", "8")}
 
 
 @pytest.mark.parametrize(
