@@ -31,9 +31,9 @@ kind             takes the first part of the datum, in the order of its fields, 
 ``pose``         a rigid (4, 4), metres: where the thing is in ``frame``
 ``trajectory``   a path: an array (N, 3) of floats, metres; (N, 2), at height 0; (N, 7), a place and
                  a unit quaternion in each row; or rigid (N, 4, 4): the line through the places in
-                 ``frame``, which is drawn again as a whole with each version.  With ``model`` as for
-                 ``joints``: an array (N, J) of its joints, rad, joined by straight lines of these;
-                 `enact view` draws the way of the arm's last frame
+                 ``frame``, which is drawn again as a whole with each version.  With ``model``, see
+                 ``joints``: an array (N, J) of an arm's joints, rad, joined by straight lines of
+                 these; `enact view` draws the way of the arm's last frame
 ``transform``    a rigid (4, 4), metres: where ``frame`` is in ``parent``; with ``inverse = true``
                  in the aspect's table: where ``parent`` is in ``frame``
 ``calibration``  a pinhole camera: ``width_px height_px fx_px fy_px cx_px cy_px``, or
