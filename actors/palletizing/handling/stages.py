@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from actors.geometry.arms.joint_paths import Arm
     from actors.palletizing.handling.nets import Net
     from actors.palletizing.placing.finger_room import Beside, Grasp
+    from actors.palletizing.placing.rows import Slot
     from actors.palletizing.vocabulary import (
         GripCommand,
         GripState,
@@ -290,7 +291,7 @@ def frames_of(net: Net, known: Known) -> dict[str, F64]:
         raise NetError(f"net {net.name}: it is not known where {error.args[0]} is") from None
 
 
-def along_and_across(plan: Plan, tray_from_product: F64) -> tuple[float, float]:
+def along_and_across(plan: Plan | Slot, tray_from_product: F64) -> tuple[float, float]:
     """Return how far beyond its place, and beside its row, a package stands, mm.
 
     Args:

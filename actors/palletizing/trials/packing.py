@@ -26,7 +26,7 @@ from actors.palletizing.control.execution import Executor
 from actors.palletizing.handling.grounding import Job, aside_net, easier_turn, ground
 from actors.palletizing.handling.nets import NetError
 from actors.palletizing.handling.reactions import NO_NET, Case, Reaction, react, worst
-from actors.palletizing.handling.stages import felt, felt_on, fills, gap_before
+from actors.palletizing.handling.stages import along_and_across, felt, felt_on, fills, gap_before
 from actors.palletizing.placing.finger_room import Gripper
 from actors.palletizing.placing.grasps import grasp_of, size_of
 from actors.palletizing.placing.rows import contacts_between, planned_rows
@@ -411,13 +411,9 @@ class Packing:
         if not where and self._is_newest(number):
             sight = self._look_at_belt(number)
             where, unfit = ("", "") if sight is None else ("belt", sight.unfit)
-        slot = self.slots[number]
         along = across = 0.0
         if seen.pose is not None:
-            off_mm = 1e3 * (seen.pose[:2, 3] - slot.tray_from_product[:2, 3])
-            push = slot.push[:2] if slot.push.any() else np.array([1.0, 0.0])
-            along = float(push @ off_mm)
-            across = float(push[0] * off_mm[1] - push[1] * off_mm[0])
+            along, across = along_and_across(self.slots[number], seen.pose)
         return replace(
             case, verdict=seen.verdict, along_mm=along, across_mm=across, turn_deg=seen.turn_deg,
             seen=where, tried=dict(tried), unfit=unfit,
@@ -487,10 +483,7 @@ class Packing:
         if own.where != "tray":
             return
         off = coordinates(slot.tray_from_product, own.tray_from_product)
-        push = slot.push if slot.push.any() else np.array([1.0, 0.0, 0.0])
-        turn = slot.tray_from_product[:3, :3].T @ push
-        packed.along_mm = 1e3 * float(turn[:2] @ off[:2])
-        packed.across_mm = 1e3 * float(turn[0] * off[1] - turn[1] * off[0])
+        packed.along_mm, packed.across_mm = along_and_across(slot, own.tray_from_product)
         packed.turn_deg = float(np.degrees(off[5]))
         if slot.push.any():
             packed.gap_mm = 1e3 * gap_m(packed.number, self.slots, truth)
