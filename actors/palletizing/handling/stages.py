@@ -36,12 +36,14 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from actors.geometry.arms.joint_paths import Arm
-    from actors.palletizing.handling.nets import Net
+    from actors.palletizing.handling.nets import Execution, Net
     from actors.palletizing.placing.finger_room import Beside, Grasp
     from actors.palletizing.placing.rows import Slot
     from actors.palletizing.vocabulary import (
+        Attached,
         GripCommand,
         GripState,
+        Outcome,
         Plan,
         Planned,
         Request,
@@ -151,6 +153,22 @@ def gap_before(short_m: float) -> float:
         short_m: So far short of it the package stands.
     """
     return max(PUSH_GAP_M, short_m)
+
+
+def way_aside(attached: Attached | None, doing: Execution | None) -> tuple[int, str]:
+    """Return the number of the net that takes the arm aside and how it ended; (0, "") if none.
+
+    An arm that ended otherwise than aside stands anywhere and hides what is below.
+    """
+    if attached is None or doing is None or attached.stage != ASIDE:
+        return 0, ""
+    return attached.number, doing.result if doing.net_version == attached.number else ""
+
+
+def is_on_belt_first(request: Request, outcome: Outcome) -> bool:
+    """Return whether the package of a request that has ended is looked for on the belt first."""
+    missed = not outcome.success and outcome.stage == "grasp"
+    return missed or (request.seen == "belt" and request.kind in {"look", "removed"})
 
 
 def stages_of(request: Request, plan: Plan | None) -> tuple[str, ...]:

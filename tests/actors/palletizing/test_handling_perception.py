@@ -15,8 +15,9 @@ from actors.palletizing.deviation import DeviationDetection
 from actors.palletizing.handling.grounding import aside_net
 from actors.palletizing.handling.nets import Execution
 from actors.palletizing.handling.stages import TAKEN_OUT, UNRECOGNISED
-from actors.palletizing.handling_perception import UNSEEN_LOOKS, EmptyBelt, HandlingPerception
+from actors.palletizing.handling_perception import EmptyBelt, HandlingPerception
 from actors.palletizing.planning import RowPlanning
+from actors.palletizing.sight.belt_sight import UNSEEN_LOOKS
 from actors.palletizing.sight.sensor import SensorError
 from actors.palletizing.simulation.cell.scene import CellLayout
 from actors.palletizing.simulation.physical_sensors import PhysicalBeltSensor, PhysicalTraySensor
