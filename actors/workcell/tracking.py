@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -34,12 +36,15 @@ from actors.workcell.vocabulary import (
 from enact_dist import Actor, View, World, WriteEach
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
     import numpy.typing as npt
 
-    from actors.workcell.vocabulary import Grid
+    from actors.workcell.vocabulary import Grid, Hull
     from enact_dist import Entity, Lock
 
     F64 = npt.NDArray[np.float64]
+    State = tuple[F64, F64]
 
 CONFIRMED_S: Final = 0.25
 """For how long a person must have been seen to count as hidden when they are seen no longer.
@@ -62,15 +67,16 @@ HIDDEN_RADIUS_MAX_M: Final = 1.5
 """Greatest radius of the prediction of a hidden person."""
 RADIUS_M: Final = (0.25, 0.6)
 """Least and greatest radius of a body."""
+LEVEL: Final = [0, 1, 3, 4]
+"""Of position and velocity what lies in the floor's plane."""
 
 
 class HumanTracking(Actor):
     """Keep an entity for each person, with track, limbs and prediction, at each hull.
 
-    A person is a component of the tight hull of 20 litres or more.  A person no longer seen
-    has left if last seen at a side of the workspace; otherwise they are hidden, and may reappear
-    wherever they may have walked.  A component seen for less than :data:`CONFIRMED_S` was not a
-    person.  What is low and still is marked as foreign, and counts as a person all the same.
+    A person is a component of the tight hull of 20 litres or more; see `Person` for what becomes
+    of one who is no longer seen.  What is low and still is marked as foreign, and counts as a
+    person all the same.
 
     Attributes:
         hidden_s_max: How long someone stays hidden before the track ends.
@@ -90,8 +96,7 @@ class HumanTracking(Actor):
 
     def __init__(self) -> None:
         self._last_ns = self._next = self._sets = 0
-        self._hidden_since_ns: dict[Entity, int] = {}
-        self._still_since: dict[Entity, tuple[F64, int]] = {}
+        self._people: dict[Entity, Person] = {}
 
     def update(self, lock: Lock) -> None:
         """Find the people of the newest hull again."""
@@ -99,171 +104,205 @@ class HumanTracking(Actor):
             return
         hull, grid, now_ns = lock[self.hull], lock[self.grid], lock.stamp_ns(self.hull)
         if now_ns < self._last_ns - SET_BACK_NS:
-            self._last_ns = 0
-            self._hidden_since_ns, self._still_since = {}, {}
+            self._last_ns, self._people = 0, {}
         seconds = (now_ns - self._last_ns) / 1e9 if self._last_ns else PERIOD_S
         if seconds <= 0.0:
             return
         self._last_ns, self._sets = now_ns, self._sets + 1
-        known = dict(lock[self.tracks].items())
-        names = sorted(known)
-        expected = {name: _moved(known[name], seconds) for name in names}
-        visible = [name for name in names if not known[name].hidden]
-        points = grid.origin_m + (hull.voxels[hull.tight] + 0.5) * grid.voxel_m
-        found = bodies(
-            points,
-            hull.component[hull.tight],
-            grid.voxel_m,
-            np.array([expected[name][0][:2] for name in visible]).reshape(-1, 2),
-        )
-        pairs = associated(
-            np.array([expected[name][0][:2] for name in names]).reshape(-1, 2),
-            np.array(
-                [self._gate_m(name, known[name], expected[name][1], now_ns) for name in names]
-            ),
-            np.array([body.centre_m for body in found]).reshape(-1, 2),
-        )
-        seen = {names[row]: found[column] for row, column in pairs}
-        for name in names:
-            if name in seen:
-                self._hidden_since_ns.pop(name, None)
-                state = corrected(*expected[name], seen[name].centre_m)
-                self._write(lock, name, state, seen[name], known[name], now_ns)
-            else:
-                self._lose(lock, name, expected[name], known[name], grid, now_ns)
-        taken = {column for _, column in pairs}
-        self._next = max(self._next, _first_free(names))
-        for column, body in enumerate(found):
-            if column not in taken:
-                state = np.r_[body.centre_m, 0.0, 0.0], np.diag([SEEN_M**2] * 2 + [1.0] * 2)
-                self._write(lock, human_entity(self._next), state, body, None, now_ns)
-                self._next += 1
-
-    def _gate_m(self, name: Entity, track: Track, covariance: F64, now_ns: int) -> float:
-        """Return how far from where they are expected a person can be."""
-        spread_m = 3.0 * float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1] + SEEN_M**2))
-        if not track.hidden:
-            return max(GATE_M, spread_m)
-        return GATE_M + WALK_M_S * self._hidden_s(name, now_ns)
-
-    def _hidden_s(self, name: Entity, now_ns: int) -> float:
-        return (now_ns - self._hidden_since_ns.setdefault(name, now_ns)) / 1e9
-
-    def _write(
-        self,
-        lock: Lock,
-        name: Entity,
-        state: tuple[F64, F64],
-        body: Body,
-        before: Track | None,
-        now_ns: int,
-    ) -> None:
-        """Write what is known of a person who is seen."""
-        height_m = body.top_m if before is None else 0.8 * before.height_m + 0.2 * body.top_m
-        first_ns = now_ns if before is None else min(before.first_ns, now_ns)
-        lock[self.tracks][name] = _track(
-            state,
-            body.top_m,
-            height_m,
-            body.volume_m3,
-            first_ns,
-            now_ns,
-            foreign=body.top_m < FOREIGN_M and self._is_still(name, body.centre_m, now_ns),
-        )
-        if before is None or before.hidden or self._sets % self.limbs_every == 0:
-            lock[self.limbs][name] = limbs(body.points_m)
-        radius_m = float(np.clip(body.radius_m, *RADIUS_M))
-        lock[self.predictions][name] = Prediction(
-            np.array(AT_S), *predicted(*state, AT_S, radius_m)
-        )
-
-    def _is_still(self, name: Entity, centre_m: F64, now_ns: int) -> bool:
-        place_m, since_ns = self._still_since.get(name, (centre_m, now_ns))
-        if np.hypot(*(centre_m - place_m)) > STILL_M:
-            place_m, since_ns = centre_m, now_ns
-        self._still_since[name] = place_m, since_ns
-        return now_ns - since_ns >= STILL_S * 1e9
-
-    def _lose(
-        self,
-        lock: Lock,
-        name: Entity,
-        state: tuple[F64, F64],
-        before: Track,
-        grid: Grid,
-        now_ns: int,
-    ) -> None:
-        """Write that a person is hidden, or that they have left."""
-        self._still_since.pop(name, None)
-        low, high = grid.origin_m[:2], grid.origin_m[:2] + grid.voxel_m * np.array(grid.shape[:2])
-        there = before.position_m[:2] if before.hidden else state[0][:2]
-        inside_m = float(np.minimum(there - low, high - there).min())
-        hidden_s = self._hidden_s(name, now_ns)
-        brief = before.seen_ns - before.first_ns < CONFIRMED_S * 1e9
-        left = not before.hidden and inside_m < EDGE_M
-        if brief or left or hidden_s > self.hidden_s_max:
-            self._hidden_since_ns.pop(name, None)
+        known = known_people(dict(lock[self.tracks].items()), self._people, now_ns)
+        self._next = max(self._next, first_free(known))
+        self._people, seen = followed(
+            known, hull, grid,
+            seconds=seconds, now_ns=now_ns, free=self._next, hidden_s_max=self.hidden_s_max,
+        )  # fmt: skip
+        for name in known.keys() - self._people.keys():
             lock[self.tracks].pop(name, None)
             lock[self.limbs].pop(name, None)
             lock[self.predictions].pop(name, None)
-            return
-        still = np.r_[before.position_m[:2], 0.0, 0.0]
+        for name, person in self._people.items():
+            lock[self.tracks][name] = person.track
+            lock[self.predictions][name] = person.prediction(seen.get(name), now_ns)
+            if name not in seen:
+                lock[self.limbs].pop(name, None)
+            elif name not in known or known[name].track.hidden or not self._sets % self.limbs_every:
+                lock[self.limbs][name] = limbs(seen[name].points_m)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Person:
+    """A person at a set: their track, and what it does not tell.
+
+    A person no longer seen has left if last seen at a side of the workspace; otherwise they are
+    hidden, and may reappear wherever they may have walked.  What was seen for less than
+    `CONFIRMED_S` was not a person.
+
+    Attributes:
+        track: What is published of them.
+        hidden_ns: Since when they are hidden, nanoseconds since 1970; 0: they are seen.
+        still_m: (2,), x and y where they have been since `still_ns`, if they are low; else None.
+        still_ns: Nanoseconds since 1970.
+    """
+
+    track: Track
+    hidden_ns: int = 0
+    still_m: F64 | None = None
+    still_ns: int = 0
+
+    @classmethod
+    def new(cls, body: Body, now_ns: int) -> Person:
+        """Return someone who is seen for the first time."""
+        state = np.r_[body.centre_m, 0.0, 0.0], np.diag([SEEN_M**2] * 2 + [1.0] * 2)
+        return cls(_track(state, body, body.top_m, now_ns, now_ns)).standing(body, now_ns)
+
+    def hidden_s(self, now_ns: int) -> float:
+        """Return for how long they have been hidden."""
+        return (now_ns - self.hidden_ns) / 1e9 if self.hidden_ns else 0.0
+
+    def moved(self, seconds: float) -> State:
+        """Return where they are some time later, as far as it is known."""
+        return moved_on(*_state(self.track), 0.0 if self.track.hidden else seconds)
+
+    def gate_m(self, covariance: F64, now_ns: int) -> float:
+        """Return how far from where they are expected, with a covariance (4, 4), they can be."""
+        if self.track.hidden:
+            return GATE_M + WALK_M_S * self.hidden_s(now_ns)
+        spread_m2 = float(np.linalg.eigvalsh(covariance[:2, :2])[-1])
+        return max(GATE_M, 3.0 * math.sqrt(spread_m2 + SEEN_M**2))
+
+    def seen(self, expected: State, body: Body, now_ns: int) -> Person:
+        """Return them where a body was seen that is theirs."""
+        height_m = 0.8 * self.track.height_m + 0.2 * body.top_m
+        first_ns = min(self.track.first_ns, now_ns)
+        track = _track(corrected(*expected, body.centre_m), body, height_m, first_ns, now_ns)
+        return replace(self, track=track, hidden_ns=0).standing(body, now_ns)
+
+    def standing(self, body: Body, now_ns: int) -> Person:
+        """Return them where a body was seen, marked as foreign if that is low and still."""
+        if body.top_m >= FOREIGN_M:
+            return self
+        place_m, since_ns = self.still_m, self.still_ns
+        if place_m is None or np.hypot(*(body.centre_m - place_m)) > STILL_M:
+            place_m, since_ns = body.centre_m, now_ns
+        track = replace(self.track, foreign=now_ns - since_ns >= STILL_S * 1e9)
+        return Person(track, 0, place_m, since_ns)
+
+    def lost(self, expected: State, grid: Grid, now_ns: int, hidden_s_max: float) -> Person | None:
+        """Return them hidden, or None if they have left."""
+        before, hidden_s = self.track, self.hidden_s(now_ns)
+        low, high = grid.origin_m[:2], grid.origin_m[:2] + grid.voxel_m * np.array(grid.shape[:2])
+        there = before.position_m[:2] if before.hidden else expected[0][:2]
+        left = not before.hidden and np.minimum(there - low, high - there).min() < EDGE_M
+        brief = before.seen_ns - before.first_ns < CONFIRMED_S * 1e9
+        if brief or left or hidden_s > hidden_s_max:
+            return None
         spread = np.diag([(SEEN_M + WALK_M_S * hidden_s) ** 2] * 2 + [WALK_M_S**2] * 2)
-        lock[self.tracks][name] = _track(
-            (still, spread),
-            float(before.position_m[2]),
-            before.height_m,
-            before.volume_m3,
-            before.first_ns,
-            before.seen_ns,
-            hidden=True,
+        still, covariance = np.zeros(3), _covariance(spread)
+        track = replace(
+            before, velocity_m_s=still, covariance=covariance, hidden=True, foreign=False
         )
-        lock[self.limbs].pop(name, None)
-        radii = RADIUS_M[0] + WALK_M_S * (hidden_s + np.array(AT_S))
-        lock[self.predictions][name] = Prediction(
+        return Person(track, self.hidden_ns or now_ns)
+
+    def prediction(self, body: Body | None, now_ns: int) -> Prediction:
+        """Return where they will be; a hidden one, who has no body, may be anywhere around."""
+        if body is not None:
+            radius_m = float(np.clip(body.radius_m, *RADIUS_M))
+            return Prediction(np.array(AT_S), *predicted(*_state(self.track), AT_S, radius_m))
+        radii = RADIUS_M[0] + WALK_M_S * (self.hidden_s(now_ns) + np.array(AT_S))
+        return Prediction(
             np.array(AT_S),
-            np.tile(before.position_m[:2], (len(AT_S), 1)),
+            np.tile(self.track.position_m[:2], (len(AT_S), 1)),
             np.minimum(radii, HIDDEN_RADIUS_MAX_M),
         )
 
 
-def _moved(track: Track, seconds: float) -> tuple[F64, F64]:
-    """Return state (4,) and covariance (4, 4) of a track some time later."""
-    if track.hidden:
-        seconds = 0.0
-    kept = [0, 1, 3, 4]
-    state = np.r_[track.position_m[:2], track.velocity_m_s[:2]]
-    return moved_on(state, track.covariance[np.ix_(kept, kept)], seconds)
+def known_people(
+    tracks: Mapping[Entity, Track], before: Mapping[Entity, Person], now_ns: int
+) -> dict[Entity, Person]:
+    """Return the people of some tracks, with what was known of them before; sorted by entity.
+
+    Someone hidden of whom no more is known, as after a restart, counts as hidden from now on.
+    """
+    found = {}
+    for name in sorted(tracks):
+        person = before.get(name) or Person(tracks[name])
+        hidden_ns = (person.hidden_ns or now_ns) if tracks[name].hidden else 0
+        found[name] = replace(person, track=tracks[name], hidden_ns=hidden_ns)
+    return found
 
 
-def _track(
-    state: tuple[F64, F64],
-    top_m: float,
-    height_m: float,
-    volume_m3: float,
-    first_ns: int,
-    seen_ns: int,
+def followed(
+    known: Mapping[Entity, Person],
+    hull: Hull,
+    grid: Grid,
     *,
-    hidden: bool = False,
-    foreign: bool = False,
-) -> Track:
-    covariance = np.zeros((6, 6))
-    kept = [0, 1, 3, 4]
-    covariance[np.ix_(kept, kept)] = state[1]
-    covariance[2, 2] = SEEN_M**2
+    seconds: float,
+    now_ns: int,
+    free: int,
+    hidden_s_max: float,
+) -> tuple[dict[Entity, Person], dict[Entity, Body]]:
+    """Return the people at a set, and the bodies of those that are seen.
+
+    Args:
+        known: The people at the set before.
+        hull: What the set shows.
+        grid: Of the hull.
+        seconds: Since the set before.
+        now_ns: Stamp of the set, nanoseconds since 1970.
+        free: Number of the first one who is new.
+        hidden_s_max: Longest time that someone stays hidden.
+    """
+    expected = {name: person.moved(seconds) for name, person in known.items()}
+    centres_m = np.array([state[:2] for state, _ in expected.values()]).reshape(-1, 2)
+    visible = [not person.track.hidden for person in known.values()]
+    points = grid.origin_m + (hull.voxels[hull.tight] + 0.5) * grid.voxel_m
+    found = bodies(points, hull.component[hull.tight], grid.voxel_m, centres_m[visible])
+    gates = [person.gate_m(expected[name][1], now_ns) for name, person in known.items()]
+    there_m = np.array([body.centre_m for body in found]).reshape(-1, 2)
+    pairs = associated(centres_m, np.array(gates), there_m)
+    names = list(known)
+    seen = {names[row]: found[column] for row, column in pairs}
+    people: dict[Entity, Person] = {}
+    for name, person in known.items():
+        if name in seen:
+            people[name] = person.seen(expected[name], seen[name], now_ns)
+        elif lost := person.lost(expected[name], grid, now_ns, hidden_s_max):
+            people[name] = lost
+    taken = {column for _, column in pairs}
+    others = [body for column, body in enumerate(found) if column not in taken]
+    for number, body in enumerate(others, free):
+        people[human_entity(number)] = Person.new(body, now_ns)
+        seen[human_entity(number)] = body
+    return people, seen
+
+
+def first_free(names: Iterable[Entity]) -> int:
+    """Return the number of the next person: above all that are there."""
+    return 1 + max((int(name.name.rpartition("/")[2]) for name in names), default=-1)
+
+
+def _state(track: Track) -> State:
+    """Return state (4,) and covariance (4, 4) of a track."""
+    state = np.r_[track.position_m[:2], track.velocity_m_s[:2]]
+    return state, track.covariance[np.ix_(LEVEL, LEVEL)]
+
+
+def _track(state: State, body: Body, height_m: float, first_ns: int, now_ns: int) -> Track:
+    """Return the track of someone who is seen now."""
     return Track(
-        position_m=np.r_[state[0][:2], top_m],
+        position_m=np.r_[state[0][:2], body.top_m],
         velocity_m_s=np.r_[state[0][2:], 0.0],
-        covariance=covariance,
+        covariance=_covariance(state[1]),
         height_m=height_m,
-        volume_m3=volume_m3,
+        volume_m3=body.volume_m3,
         first_ns=first_ns,
-        hidden=hidden,
-        seen_ns=seen_ns,
-        foreign=foreign,
+        hidden=False,
+        seen_ns=now_ns,
     )
 
 
-def _first_free(names: list[Entity]) -> int:
-    """Return the number of the next person: above all that are there."""
-    return 1 + max((int(name.name.rpartition("/")[2]) for name in names), default=-1)
+def _covariance(level: F64) -> F64:
+    """Return the covariance (6, 6) of position and velocity, by that in the floor's plane."""
+    covariance = np.zeros((6, 6))
+    covariance[np.ix_(LEVEL, LEVEL)] = level
+    covariance[2, 2] = SEEN_M**2
+    return covariance

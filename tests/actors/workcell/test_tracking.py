@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from actors.geometry.people import associated, body_of, limbs
-from actors.workcell.tracking import HumanTracking
+from actors.geometry.people import WALK_M_S, Body, associated, body_of, limbs
+from actors.workcell.tracking import GATE_M, HumanTracking, Person, followed, known_people
 from actors.workcell.vocabulary import (
     GRID,
     HULL,
@@ -277,3 +277,75 @@ def test_body_is_measured_exactly():
     assert seen.top_m == pytest.approx(2.0)
     assert seen.volume_m3 == pytest.approx(2.0)
     assert 0.5 < seen.radius_m < 0.71
+
+
+GRID_OF_CELL = Grid(ORIGIN_M, VOXEL_M, SHAPE)
+
+
+def someone(x_m=0.0, *, top_m=1.7, seen_s=1.0, now_ns=START_NS):
+    """A person who has been seen for a while, and the body."""
+    at = Body(np.zeros((1, 3)), np.array([x_m, 0.0]), top_m, 0.06, 0.2)
+    person = Person.new(at, now_ns - round(seen_s * 1e9))
+    return person.seen(person.moved(0.0), at, now_ns), at
+
+
+@pytest.mark.parametrize(
+    ("x_m", "seen_s", "kept"), [(0.0, 1.0, True), (1.7, 1.0, False), (0.0, 0.1, False)]
+)
+def test_who_is_lost_is_hidden_unless_at_a_side_or_seen_too_briefly(x_m, seen_s, kept):
+    """The middle hides, a side lets leave, and an arm of a moment is nobody."""
+    person, _ = someone(x_m, seen_s=seen_s)
+    lost = person.lost(person.moved(0.1), GRID_OF_CELL, START_NS, 300.0)
+    assert (lost is not None) == kept
+    assert lost is None or (lost.track.hidden, lost.hidden_ns) == (True, START_NS)
+
+
+def test_who_is_hidden_may_be_farther_away_every_second_and_is_given_up_at_last():
+    """The gate grows as fast as a person walks; the prediction around the last place, too."""
+    person, _ = someone()
+    hidden = person.lost(person.moved(0.1), GRID_OF_CELL, START_NS, 5.0)
+    later_ns = START_NS + 10**9
+    state, covariance = hidden.moved(1.0)
+    assert state[:2] == pytest.approx(person.track.position_m[:2])
+    gates = [hidden.gate_m(covariance, now_ns) for now_ns in (START_NS, later_ns)]
+    assert gates == pytest.approx([GATE_M, GATE_M + WALK_M_S])
+    radii = [hidden.prediction(None, now_ns).radius_m[0] for now_ns in (START_NS, later_ns)]
+    assert radii == pytest.approx([0.25 + 0.1 * WALK_M_S, 1.5])
+    kept = hidden.lost((state, covariance), GRID_OF_CELL, later_ns, 5.0)
+    assert (kept.hidden_ns, kept.track.seen_ns) == (START_NS, START_NS)
+    end_ns = START_NS + 5 * 10**9 + 1
+    assert hidden.lost((state, covariance), GRID_OF_CELL, end_ns, 5.0) is None
+
+
+@pytest.mark.parametrize(
+    ("top_m", "move_m", "foreign"), [(0.4, 0.0, True), (0.4, 0.06, False), (1.7, 0.0, False)]
+)
+def test_what_is_low_and_still_is_foreign(top_m, move_m, foreign):
+    """A move of more than 5 cm starts the three seconds again."""
+    person, at = someone(top_m=top_m, seen_s=0.0)
+    at = Body(at.points_m, np.array([move_m, 0.0]), top_m, 0.06, 0.2)
+    for second in (1, 2, 3):
+        person = person.seen(person.moved(1.0), at, START_NS + second * 10**9)
+    assert person.track.foreign is foreign
+
+
+def test_a_restart_knows_no_longer_since_when_someone_is_hidden():
+    """They count as hidden from now on; who is seen counts as seen, whatever was remembered."""
+    person, _ = someone()
+    hidden = person.lost(person.moved(0.1), GRID_OF_CELL, START_NS, 300.0)
+    name, later_ns = human_entity(3), START_NS + 10**9
+    assert known_people({name: hidden.track}, {}, later_ns)[name].hidden_ns == later_ns
+    assert known_people({name: hidden.track}, {name: hidden}, later_ns)[name].hidden_ns == START_NS
+    assert known_people({name: person.track}, {name: hidden}, later_ns)[name].hidden_ns == 0
+
+
+def test_bodies_that_are_nobodys_are_new_people():
+    """The known one keeps their entity; the others take the next free numbers."""
+    person, _ = someone(-0.6)
+    known = {human_entity(2): person}
+    people, seen = followed(
+        known, hull_of(body((-0.6, 0.0)), body((0.6, 0.5)), body((0.6, -0.5))), GRID_OF_CELL,
+        seconds=0.1, now_ns=START_NS, free=5, hidden_s_max=300.0,
+    )  # fmt: skip
+    assert list(people) == list(seen) == [human_entity(number) for number in (2, 5, 6)]
+    assert people[human_entity(2)].track.first_ns == person.track.first_ns
