@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -39,7 +39,7 @@ from actors.workcell.vocabulary import (
 from enact_dist import Actor, View, ViewEach, World, Write
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
 
     import numpy.typing as npt
 
@@ -67,6 +67,9 @@ BEYOND_RAD: Final = 0.01
 """So far beyond where the arm can be by then it leaves its path."""
 LOOKED_RAD: Final = 0.03
 """Distance of the states that are looked at along a path."""
+PAUSE: Final = 2
+"""Sets after which a search that found no way is repeated, where the arm rests without a path."""
+FORESEEN: Final = "someone will be in the way"
 CUT_OFF: Final = "someone is in the way before the arm can leave its path"
 
 
@@ -149,14 +152,209 @@ class Branch:
         return PathSpeeds(model, both, nominal_m_s=NOMINAL_M_S)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Followed:
+    """Along what the arm moves.
+
+    Attributes:
+        path: Identity of the last path.
+        speeds: Along it, with what it was left for.
+        left: Along what the arm goes on if it refuses the last path; None: it has none.
+    """
+
+    path: object
+    speeds: PathSpeeds
+    left: PathSpeeds | None = None
+
+    @classmethod
+    def from_rest(cls, path: Path, model: ArmModel) -> Followed:
+        """Return what an arm follows that has come to rest before a path."""
+        speeds = PathSpeeds(model, JointPath(path.waypoints), nominal_m_s=NOMINAL_M_S)
+        return cls(path.identity, speeds)
+
+    def along(self, *, is_refused: bool) -> PathSpeeds:
+        """Return along what the arm moves, which may have refused the last path."""
+        return self.left if is_refused and self.left is not None else self.speeds
+
+
+@dataclass(frozen=True, slots=True)
+class Waits:
+    """What planning waits for, from set to set.
+
+    Attributes:
+        blocked: Sets in a row that showed the path blocked.
+        pause: Sets in which no way is searched, after a search found none.
+        there_since_ns: Since when the arm dwells at its goal, ns since 1970; 0: it does not.
+    """
+
+    blocked: int = 0
+    pause: int = 0
+    there_since_ns: int = 0
+
+    def after(self, found: Plan) -> Waits:
+        """Return what is waited for after a search."""
+        return Waits(pause=self.pause if len(found.waypoints) else PAUSE)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Search:
+    """A path that is to be found.
+
+    Attributes:
+        start: Where it begins, (7,) rad, if it has no `branch`.
+        goal: Number of the goal where it leads.
+        around: What people take, the most careful first; the last is what counts.  Empty if
+            someone is in the way to the `branch`.
+        why: Why it replaces the last one.
+        from_goal: Number of the goal that it comes from; None: as the last path.
+        branch: Where a moving arm leaves its path.
+    """
+
+    start: F64
+    goal: int
+    around: tuple[CellGrid, ...]
+    why: str = ""
+    from_goal: int | None = None
+    branch: Branch | None = None
+
+    def found(self, scene: Scene, *, seed: int, limit_s: float) -> Plan:
+        """Return the path, or why there is none; it takes as long as the limit at most."""
+        ends_s, found = time.monotonic() + limit_s, Plan(np.empty((0, len(self.start))), CUT_OFF, 0)
+        for cells in self.around:
+            found = plan(
+                self.start if self.branch is None else self.branch.q_rad,
+                scene.task.goals[self.goal],
+                scene.obstacles.free(cells).free,
+                scene.obstacles.passable(cells).free,
+                q_max_rad=scene.model.q_max,
+                seed=seed,
+                limit_s=max(ends_s - time.monotonic(), 0.02),
+                heading=None if self.branch is None else self.branch.heading,
+            )
+            if len(found.waypoints):
+                break
+        return found
+
+    def is_news(self, found: Plan, last: Path | None) -> bool:
+        """Return whether what was found replaces the last path.
+
+        That there is no way is said once; and it is no reason to leave a path that is still free.
+        """
+        if len(found.waypoints) or last is None:
+            return True
+        return self.why != FORESEEN and last.reason != found.reason
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """What path planning knows at a set.
+
+    Attributes:
+        model: The arm.
+        joints: Its newest samples.
+        task: Its goals.
+        last: The path before; None: there is none.
+        refusal: Why the robot refused it; empty if it did not.
+        followed: Along what the arm moves; None if `last` has no waypoints.
+        obstacles: What is static.
+        now: The cells that people take.
+        soon: With those that they take within `SOON_S`; `now` itself if nobody is predicted.
+        later: With all those that they take as far as is predicted.
+        captured_ns: Stamp of the set, nanoseconds since 1970.
+        ahead_s: How much of the path is looked at.
+        branch_s: How long a path takes to the robot.
+    """
+
+    model: ArmModel
+    joints: Joints
+    task: Task
+    last: Path | None
+    refusal: str
+    followed: Followed | None
+    obstacles: Obstacles
+    now: CellGrid
+    soon: CellGrid
+    later: CellGrid
+    captured_ns: int
+    ahead_s: float
+    branch_s: float
+
+    def due(self, before: Waits, now_ns: Callable[[], int]) -> tuple[Search | None, Waits]:
+        """Return which path is to be found, None if no other one, and what is waited for.
+
+        If the path is blocked in two sets in a row, or the robot has refused it, another one is
+        due.  A moving arm goes over to it at a place that it reaches only when that path is there.
+
+        Args:
+            before: What was waited for at the last set.
+            now_ns: The time; asked once the path was looked at, which takes milliseconds.
+        """
+        last, q = self.last, self.joints.q[-1]
+        is_at_rest = bool(np.abs(self.joints.dq).max() < 1e-6)
+        goal = last.to_goal if last is not None and last.to_goal < len(self.task.goals) else 0
+        search = Search(q, goal, (self.later, self.now))
+        if last is None or self.followed is None:
+            waits = replace(before, pause=before.pause - 1)
+            return (search if waits.pause < 0 and is_at_rest else None), waits
+        if is_at_rest and np.linalg.norm(q - self.task.goals[goal]) < HERE_RAD:
+            return self._dwelt(goal, before)
+        waits = replace(before, there_since_ns=0)
+        speeds = self.followed.along(is_refused=bool(self.refusal))
+        s_rad = speeds.path.nearest_rad(q)
+        off_rad = float(np.linalg.norm(speeds.path.at(s_rad)[0][0] - q))
+        has_moved = np.linalg.norm(last.waypoints[-1] - self.task.goals[goal]) > HERE_RAD
+        if is_at_rest and (off_rad > OFF_RAD or has_moved or self.refusal):
+            why = "the task has changed" if has_moved else self.refusal or "the arm is off its path"
+            return replace(search, why=why), waits
+        there = speeds.within(s_rad, self.ahead_s)
+        ahead = speeds.path.states(s_rad, float(speeds.places_rad[there][-1]), LOOKED_RAD)
+        passable = self.obstacles.passable(self.now)
+        is_blocked = not passable.free(ahead).all()
+        is_foreseen = (
+            self.soon is not self.now and not self.obstacles.passable(self.soon).free(ahead).all()
+        )
+        waits = replace(waits, blocked=waits.blocked + 1 if is_blocked or is_foreseen else 0)
+        if waits.blocked < 2 and not self.refusal:
+            return None, waits
+        branch = None if is_at_rest else self._branch(speeds, s_rad, now_ns())
+        search = replace(search, branch=branch)
+        if self.refusal or is_blocked:
+            is_reached = branch is None or passable.free(branch.before_rad).all()
+            around = search.around if is_reached else ()
+            why = self.refusal or "someone is in the way"
+            return replace(search, around=around, why=why), waits
+        if waits.blocked % 3 == 2:
+            return replace(search, around=(self.later,), why=FORESEEN), waits
+        return None, waits
+
+    def _dwelt(self, goal: int, before: Waits) -> tuple[Search | None, Waits]:
+        """Stay at a goal as long as the task says, then go on to the next one."""
+        task, following = self.task, goal + 1
+        waits = replace(before, there_since_ns=before.there_since_ns or self.captured_ns)
+        stays = self.captured_ns - waits.there_since_ns < task.dwell_s[goal] * 1e9
+        is_last = following >= len(task.goals) and (not task.cyclic or len(task.goals) == 1)
+        if stays or is_last:
+            return None, waits
+        to = following % len(task.goals)
+        return Search(task.goals[goal], to, (self.later, self.now), from_goal=goal), waits
+
+    def _branch(self, speeds: PathSpeeds, s_rad: float, now_ns: int) -> Branch:
+        """Return where a moving arm will be able to leave its path when another one arrives."""
+        along = max(float(np.linalg.norm(speeds.path.at(s_rad)[1][0])), 0.1)
+        speed_rad_s = float(np.linalg.norm(self.joints.dq[-1])) / along
+        age_s = max(0.0, (now_ns - int(self.joints.stamp_ns[-1])) / 1e9)
+        reached_rad = speeds.reached_rad(s_rad, speed_rad_s, age_s + self.branch_s)
+        return Branch(speeds, s_rad, speeds.path.straight_rad(reached_rad + BEYOND_RAD))
+
+
 class PathPlanning(Actor):
     """Keep a path to the next goal of the task, at each hull.
 
-    The next second of the path is looked at.  If it is blocked in two sets in a row, another path
-    is planned.  A moving arm goes over to it without a stop, at a place that it reaches only when
-    the path is there; an arm that is past that place refuses the path and brakes, and the next set
-    plans again.  Without a way, or if someone is in the way to that place, the path has no
-    waypoints and says why.  Predicted positions of people are avoided if another way exists.
+    The next second of the path is looked at; `Scene.due` says when another one is planned.  A
+    moving arm goes over to it without a stop; an arm that is past the place where it should leave
+    its path refuses the new one and brakes, and the next set plans again.  Without a way, or if
+    someone is in the way to that place, the path has no waypoints and says why.  Predicted
+    positions of people are avoided if another way exists.
 
     Attributes:
         predict: Whether predictions count.
@@ -189,11 +387,8 @@ class PathPlanning(Actor):
         super().__init__()
         self.predict, self.seed = predict, seed
         self._obstacles: tuple[bytes, Obstacles] | None = None
-        self._followed: tuple[object, PathSpeeds] | None = None
-        self._left: PathSpeeds | None = None
-        self._blocked = 0
-        self._pause = 0
-        self._there_since_ns = 0
+        self._followed: Followed | None = None
+        self._waits = Waits()
 
     def start(self) -> None:
         """Load the planner before any lock is held."""
@@ -207,168 +402,67 @@ class PathPlanning(Actor):
         """Look at the path; plan another one where that is due."""
         if any(map(lock.is_null, (self.model, self.task, self.joints, self.grid))):
             return
-        joints, task, last = lock[self.joints], lock[self.task], lock.get(self.path)
-        q = joints.q[-1]
-        at_rest = bool(np.abs(joints.dq).max() < 1e-6)
-        goal = last.to_goal if last is not None and last.to_goal < len(task.goals) else 0
-        obstacles = self._known(lock)
-        hull = lock[self.hull]
-        predictions = list(lock[self.predictions].values()) if self.predict else []
-        now = obstacles.around(hull, [], 0.0)
-        soon = obstacles.around(hull, predictions, SOON_S) if predictions else now
-        later = obstacles.around(hull, predictions, np.inf) if predictions else now
-        if last is None or not len(last.waypoints):
-            self._pause -= 1
-            if self._pause < 0 and at_rest:
-                self._plan(lock, obstacles, [later, now], q, goal, "")
+        scene = self._scene(lock)
+        search, self._waits = scene.due(self._waits, self.now_ns)
+        if search is None:
             return
-        if at_rest and np.linalg.norm(q - task.goals[goal]) < HERE_RAD:
-            self._dwell(lock, obstacles, [later, now], task, goal)
-            return
-        self._there_since_ns = 0
-        refusal = self._refusal(lock, last)
-        speeds = self._speeds_along(lock[self.model], last, refused=bool(refusal))
-        line = speeds.path
-        s_rad = line.nearest_rad(q)
-        off_rad = float(np.linalg.norm(line.at(s_rad)[0][0] - q))
-        moved_on = np.linalg.norm(last.waypoints[-1] - task.goals[goal]) > HERE_RAD
-        if at_rest and (off_rad > OFF_RAD or moved_on or refusal):
-            why = "the task has changed" if moved_on else refusal or "the arm is off its path"
-            self._plan(lock, obstacles, [later, now], q, goal, why)
-            return
-        there = speeds.within(s_rad, self.ahead_s)
-        ahead = line.states(s_rad, float(speeds.places_rad[there][-1]), LOOKED_RAD)
-        passable = obstacles.passable(now)
-        blocked = not passable.free(ahead).all()
-        avoid = bool(predictions) and not obstacles.passable(soon).free(ahead).all()
-        self._blocked = self._blocked + 1 if blocked or avoid else 0
-        if self._blocked < 2 and not refusal:
-            return
-        branch = None if at_rest else self._branch(speeds, s_rad, joints)
-        if refusal or blocked:
-            why = refusal or "someone is in the way"
-            reached = branch is None or passable.free(branch.before_rad).all()
-            cells = [later, now] if reached else []
-            self._plan(lock, obstacles, cells, q, goal, why, branch=branch)
-        elif self._blocked % 3 == 2:
-            why = "someone will be in the way"
-            self._plan(lock, obstacles, [later], q, goal, why, branch=branch)
-
-    def _dwell(
-        self, lock: Lock, obstacles: Obstacles, cells: list[CellGrid], task: Task, goal: int
-    ) -> None:
-        """Stay at a goal as long as the task says, then go on to the next one."""
-        stamp_ns = lock.stamp_ns(self.hull)
-        self._there_since_ns = self._there_since_ns or stamp_ns
-        if stamp_ns - self._there_since_ns < task.dwell_s[goal] * 1e9:
-            return
-        following = goal + 1
-        if following >= len(task.goals) and not task.cyclic:
-            return
-        if len(task.goals) > 1:
-            start, to = task.goals[goal], following % len(task.goals)
-            self._plan(lock, obstacles, cells, start, to, "", from_goal=goal)
-
-    def _plan(
-        self,
-        lock: Lock,
-        obstacles: Obstacles,
-        cells: list[CellGrid],
-        start: F64,
-        goal: int,
-        why: str,
-        from_goal: int | None = None,
-        branch: Branch | None = None,
-    ) -> None:
-        """Write a path from a state to a goal, or the absence of one.
-
-        Args:
-            lock: Of the update.
-            obstacles: What to keep from.
-            cells: What people take, the most careful first; the last is what counts.  Empty if
-                someone is in the way to the `branch`.
-            start: Where the path begins, (7,), if it has no `branch`.
-            goal: Where it leads.
-            why: Why it replaces the last one.
-            from_goal: Goal that it comes from; None: as the last path.
-            branch: Where a moving arm leaves its path.
-        """
-        last, began_s = lock.get(self.path), time.monotonic()
+        last, began_s = scene.last, time.monotonic()
         number = last.number + 1 if last is not None else 1
-        only_wish = last is not None and why == "someone will be in the way"
-        found = Plan(np.empty((0, len(start))), CUT_OFF, 0)
-        for one in cells:
-            left_s = self.limit_s - (time.monotonic() - began_s)
-            found = plan(
-                start if branch is None else branch.q_rad,
-                lock[self.task].goals[goal],
-                obstacles.free(one).free,
-                obstacles.passable(one).free,
-                q_max_rad=lock[self.model].q_max,
-                seed=self.seed + number,
-                limit_s=max(left_s, 0.02),
-                heading=None if branch is None else branch.heading,
-            )
-            if len(found.waypoints) or one is cells[-1]:
-                break
-        self._blocked, self._there_since_ns = 0, 0
-        if not len(found.waypoints):
-            self._pause = 2
-            if only_wish or (last is not None and last.reason == found.reason):
-                return
-        if from_goal is None:
-            from_goal = last.from_goal if last is not None else -1
-        length_rad = float(np.linalg.norm(np.diff(found.waypoints, axis=0), axis=1).sum())
+        found = search.found(scene, seed=self.seed + number, limit_s=self.limit_s)
+        self._waits = self._waits.after(found)
+        if not search.is_news(found, last):
+            return
+        came_from = last.from_goal if last is not None else -1
         path = Path(
             waypoints=found.waypoints,
             number=number,
-            from_goal=from_goal,
-            to_goal=goal,
+            from_goal=came_from if search.from_goal is None else search.from_goal,
+            to_goal=search.goal,
             planned_ns=self.now_ns(),
-            length_rad=length_rad,
-            reason=found.reason or why,
+            length_rad=float(np.linalg.norm(np.diff(found.waypoints, axis=0), axis=1).sum()),
+            reason=found.reason or search.why,
             took_ms=1e3 * (time.monotonic() - began_s),
-            captured_ns=lock.stamp_ns(self.hull),
+            captured_ns=scene.captured_ns,
         )
         lock[self.path] = path
+        branch = search.branch
         if branch is not None and len(path.waypoints):
-            self._followed = path.identity, branch.onto(path, lock[self.model])
-            self._left = branch.speeds
+            onto = branch.onto(path, scene.model)
+            self._followed = Followed(path.identity, onto, branch.speeds)
 
-    def _refusal(self, lock: Lock, last: Path) -> str:
-        """Say why the robot refused the last path; empty if it did not."""
-        done = lock.get(self.execution)
-        if done is None or done.refused_path != last.identity:
-            return ""
-        return done.path_refusal
-
-    def _branch(self, speeds: PathSpeeds, s_rad: float, joints: Joints) -> Branch:
-        """Return where a moving arm will be able to leave its path when another one arrives."""
-        along = max(float(np.linalg.norm(speeds.path.at(s_rad)[1][0])), 0.1)
-        speed_rad_s = float(np.linalg.norm(joints.dq[-1])) / along
-        age_s = max(0.0, (self.now_ns() - int(joints.stamp_ns[-1])) / 1e9)
-        reached_rad = speeds.reached_rad(s_rad, speed_rad_s, age_s + self.branch_s)
-        return Branch(speeds, s_rad, speeds.path.straight_rad(reached_rad + BEYOND_RAD))
-
-    def _known(self, lock: Lock) -> Obstacles:
-        """Return what is static, worked out once as long as it stays the same."""
+    def _scene(self, lock: Lock) -> Scene:
+        """Return what is known; what is the same as before is worked out once."""
+        model, grid, hull = lock[self.model], lock[self.grid], lock[self.hull]
         boxes = [np.reshape(one, (-1, 15)) for _, one in sorted(lock[self.boxes].items())]
         rows = np.concatenate([np.empty((0, 15)), *boxes])
-        model, grid = lock[self.model], lock[self.grid]
         size = np.array([grid.voxel_m, *grid.shape])
         parts = (rows, model.dh, model.base, model.capsules, grid.origin_m, size)
         key = b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
         if self._obstacles is None or self._obstacles[0] != key:
             self._obstacles = key, Obstacles(model, grid, rows)
-        return self._obstacles[1]
-
-    def _speeds_along(self, model: ArmModel, path: Path, *, refused: bool) -> PathSpeeds:
-        """Return along what the arm moves: the last path, with what it followed before."""
-        if self._followed is None or self._followed[0] != path.identity:
-            line = JointPath(path.waypoints)
-            self._followed = path.identity, PathSpeeds(model, line, nominal_m_s=NOMINAL_M_S)
-            self._left = None
-        return self._left if refused and self._left is not None else self._followed[1]
+        obstacles = self._obstacles[1]
+        last, done = lock.get(self.path), lock.get(self.execution)
+        path = last if last is not None and len(last.waypoints) else None
+        if path and (self._followed is None or self._followed.path != path.identity):
+            self._followed = Followed.from_rest(path, model)
+        is_refused = done and path and done.refused_path == path.identity
+        predictions = list(lock[self.predictions].values()) if self.predict else []
+        now = obstacles.around(hull, [], 0.0)
+        return Scene(
+            model=model,
+            joints=lock[self.joints],
+            task=lock[self.task],
+            last=last,
+            refusal=done.path_refusal if done and is_refused else "",
+            followed=self._followed if path else None,
+            obstacles=obstacles,
+            now=now,
+            soon=obstacles.around(hull, predictions, SOON_S) if predictions else now,
+            later=obstacles.around(hull, predictions, np.inf) if predictions else now,
+            captured_ns=lock.stamp_ns(self.hull),
+            ahead_s=self.ahead_s,
+            branch_s=self.branch_s,
+        )
 
 
 class PlanningWithSpeed(PathPlanning, SpeedControl):  # type: ignore[misc]  # one writes the path
