@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from actors.palletizing.control.controller import open_controller
@@ -30,10 +31,13 @@ from actors.palletizing.vocabulary import (
     place_entity,
     product_entity,
 )
-from enact_dist import Actor, View, ViewEach, World, Write
+from enact_dist import Actor, Entity, View, ViewEach, World, Write
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from actors.palletizing.control.controller import BeltController
+    from actors.palletizing.vocabulary import Attached, Outcome, Plan, Planned, Request, Result
     from enact_dist import Lock
 
 OFF_THE_BELT: Final = ("place", "push", "remove")
@@ -102,85 +106,118 @@ class BeltConveyor(Actor):
 
     def update(self, lock: Lock) -> None:
         """Start the belt, or say that a package has come."""
-        plans, trained = lock[self.plans], lock[self.grasps].keys()
-        last = lock.get(self.arrival)
-        coming = 0 if last is None else last.number + 1
-        place = place_entity(coming)
-        if last is not None and not self._runs_s and self._is_overlooked(lock, last):
-            lock[self.arrival] = Arrival(last.number, time.time_ns())
+        last, plans = lock.get(self.arrival), lock[self.plans]
+        number = 0 if last is None else last.number + 1
+        request, attached = lock.get(self.request), lock.get(self.attached)
+        outcome, results = lock.get(self.outcome), lock.get(self.results, {})
+        came = None if last is None else Came(last, request, attached, outcome, results)
+        if came is not None and not self._runs_s and (again := self._again(came)) is not None:
+            lock[self.arrival] = again
             return
-        if last is not None and not self._runs_s and self._is_gone(lock, last):
-            lock[self.arrival] = Arrival(last.number, time.time_ns(), is_gone=True)
-            return
-        if place not in plans or lock.is_null(self.empty):
+        if place_entity(number) not in plans or lock.is_null(self.empty):
             return
         if not self._runs_s:
+            trained = lock[self.grasps].keys()
             if any(product_entity(plan.product) not in trained for plan in plans.values()):
                 return
-            if last is not None and not self._is_free(lock, last.number):
-                return
-            self._run()
+            is_last = came is not None and came.ends_tray(plans)
+            if came is None or came.is_off(lock.get(self.planned), ends_tray=is_last):
+                if is_last:
+                    self.belt.change_tray()
+                self._run()
         elif self.belt.arrived():
-            lock[self.arrival] = Arrival(coming, time.time_ns())
+            lock[self.arrival] = Arrival(number, time.time_ns())
             self._runs_s = 0.0
         elif time.monotonic() - self._runs_s > LATE_S:
-            print(f"package {coming} has not come for {LATE_S:g} s; the belt is run again")
+            print(f"package {number} has not come for {LATE_S:g} s; the belt is run again")
             self._run()
 
     def _run(self) -> None:
         self.belt.run_belt()
         self._runs_s = time.monotonic()
 
-    def _is_overlooked(self, lock: Lock, last: Arrival) -> bool:
-        """Return whether no request is about what has come: it was not seen, and is reported again.
+    def _again(self, came: Came) -> Arrival | None:
+        """Return what came last as it is reported again, None if it need not be."""
+        number, now_ns = came.last.number, time.time_ns()
+        if came.is_overlooked(now_ns) and self.belt.arrived():
+            return Arrival(number, now_ns)
+        if came.last.is_gone or came.is_followed or self.belt.arrived():
+            self._free_s = 0.0
+            return None
+        self._free_s = self._free_s or time.monotonic()
+        is_gone = time.monotonic() - self._free_s >= FREE_S
+        return Arrival(number, now_ns, is_gone=True) if is_gone else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Came:
+    """The package that came last, and what has become of it.
+
+    Attributes:
+        last: Its arrival.
+        request: The last one, about whatever.
+        attached: The net that the robot executes; None: none.
+        outcome: How the last request ended.
+        results: What became of each package so far, by name of its place.
+    """
+
+    last: Arrival
+    request: Request | None
+    attached: Attached | None
+    outcome: Outcome | None
+    results: Mapping[str, Result]
+
+    @property
+    def place(self) -> str:
+        """Name of the place that it is for."""
+        return place_entity(self.last.number).name
+
+    def is_overlooked(self, now_ns: int) -> bool:
+        """Return whether no request is about it: if it is there, it was not seen.
 
         A package that fell back onto the belt stops it in the light barrier, too; when that is
         taken away, the one after it comes unseen.
         """
-        name, request = place_entity(last.number).name, lock.get(self.request)
-        results = lock.get(self.results, {})
-        is_idle = request is None or (request.place != name and request.place in results)
-        waits_s = 1e-9 * (time.time_ns() - last.stamp_ns)
-        return is_idle and name not in results and waits_s > OVERLOOKED_S and self.belt.arrived()
+        request, waits_s = self.request, 1e-9 * (now_ns - self.last.stamp_ns)
+        is_idle = request is None or (request.place != self.place and request.place in self.results)
+        return is_idle and self.place not in self.results and waits_s > OVERLOOKED_S
 
-    def _is_gone(self, lock: Lock, last: Arrival) -> bool:
-        """Return whether what has come was taken out of the light barrier before it was recognised.
+    @property
+    def is_followed(self) -> bool:
+        """Whether it was recognised, or its place is closed.
 
         Whatever a request names as its package is followed by perception; what came and was not
-        recognised has no name.
+        recognised has no name: the light barrier alone tells when it is taken out.
         """
-        name, request = place_entity(last.number).name, lock.get(self.request)
-        named = request is not None and request.place == name and bool(request.package)
-        closed = name in lock.get(self.results, {})
-        if last.is_gone or named or closed or self.belt.arrived():
-            self._free_s = 0.0
-            return False
-        self._free_s = self._free_s or time.monotonic()
-        return time.monotonic() - self._free_s >= FREE_S
+        request = self.request
+        is_named = request is not None and request.place == self.place and bool(request.package)
+        return is_named or self.place in self.results
 
-    def _is_free(self, lock: Lock, number: int) -> bool:
-        """Return whether a package is off the belt; change the tray if it was its last one.
+    def ends_tray(self, plans: Mapping[Entity, Plan]) -> bool:
+        """Return whether the package after it is for another tray; there is one."""
+        following = place_entity(self.last.number + 1)
+        return plans[following].tray != plans[Entity(self.place)].tray
+
+    def is_off(self, planned: Planned | None, *, ends_tray: bool) -> bool:
+        """Return whether the next one can come: this one is off the belt.
 
         A tray is changed when no place is open any more, and by a plan that knows all results:
         when a package was rejected, the one after it may still find room.
+
+        Args:
+            planned: What the plans take into account.
+            ends_tray: The tray has to be changed first.
         """
-        place, plans, results = place_entity(number), lock[self.plans], lock.get(self.results, {})
-        done = place.name in results
-        if plans[place_entity(number + 1)].tray != plans[place].tray:
-            closed = len(results) == number + 1 and is_current(lock.get(self.planned), results)
-            if closed:
-                self.belt.change_tray()
-            return closed
-        request, attached = lock.get(self.request), lock.get(self.attached)
-        if request is None or request.place != place.name:
-            return done
-        is_pushed = (
-            attached is not None and attached.request == request.number and attached.stage == "push"
-        )
-        outcome = lock.get(self.outcome)
-        is_off = (
-            outcome is not None
-            and outcome.request == request.number
-            and (outcome.success and outcome.stage in OFF_THE_BELT)
-        )
-        return done or is_pushed or is_off
+        request, attached, outcome = self.request, self.attached, self.outcome
+        if ends_tray:
+            is_closed = len(self.results) == self.last.number + 1
+            return is_closed and is_current(planned, self.results)
+        if self.place in self.results:
+            return True
+        if request is None or request.place != self.place:
+            return False
+        if attached is not None and (attached.request, attached.stage) == (request.number, "push"):
+            return True
+        if outcome is None or outcome.request != request.number:
+            return False
+        return outcome.success and outcome.stage in OFF_THE_BELT

@@ -35,8 +35,9 @@ from enact_dist import Actor, View, ViewEach, World, Write, WriteEach
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from actors.geometry.shapes import Surface
     from actors.palletizing.vocabulary import Result
-    from enact_dist import Lock
+    from enact_dist import Entity, Lock
 
 
 class Planning(Actor):
@@ -117,41 +118,57 @@ class RowPlanning(Actor):
         results, before = lock.get(self.results, {}), lock.get(self.planned)
         if is_current(before, results):
             return
-        left_out = self._left_out(results, before)
-        if before is None or left_out != before.left_out:
-            self._plan(lock, [n for n in range(self.packages) if n not in left_out], set(results))
-        lock[self.planned] = Planned(results_of(results), left_out)
-
-    def _left_out(self, results: Mapping[str, Result], before: Planned | None) -> tuple[int, ...]:
-        """Return the packages whose places are filled by later ones.
-
-        One that has no result has not come yet, whatever an online context before this one held.
-        """
-        came = {n: results[name] for n in range(self.packages) if (name := _name(n)) in results}
-        stands = [number for number, result in came.items() if result.result in STANDS]
-        last = max(stands, default=-1)
-        gone = {number for number in came if number > last}
-        left_before = set() if before is None else set(before.left_out)
-        return tuple(sorted(gone | (left_before & came.keys())))
-
-    def _plan(self, lock: Lock, coming: list[int], done: set[str]) -> None:
-        """Plan the places of the packages that come, except of those that are there."""
-        request = lock.get(self.request)
-        fixed = done if request is None else {*done, request.place}
-        products = [self.products[number % len(self.products)] for number in coming]
-        models = {
-            product: lock[self.surfaces][product_entity(product)] for product in set(products)
-        }
-        sizes = {product: size_of(model) for product, model in models.items()}
-        slots = planned_rows(products, sizes, contacts_between(models))
-        for number, product, slot in zip(coming, products, slots, strict=True):
-            place = place_entity(number)
-            if place.name not in fixed or place not in lock[self.plans]:
-                lock[self.plans][place] = Plan(
-                    product, slot.tray, slot.tray_from_product, slot.push
-                )
-                lock[self.standing][place] = Standing(product, "ok", shift_mm=0.0, turn_deg=0.0)
+        empty = left_out(self.packages, results, before)
+        if before is None or empty != before.left_out:
+            products = {
+                number: self.products[number % len(self.products)]
+                for number in range(self.packages)
+                if number not in empty
+            }
+            request, plans = lock.get(self.request), lock[self.plans]
+            fixed = set(results) if request is None else {*results, request.place}
+            for place, plan in plans_of(products, lock[self.surfaces]).items():
+                if place.name not in fixed or place not in plans:
+                    plans[place] = plan
+                    standing = Standing(plan.product, "ok", shift_mm=0.0, turn_deg=0.0)
+                    lock[self.standing][place] = standing
+        lock[self.planned] = Planned(results_of(results), empty)
 
 
-def _name(number: int) -> str:
-    return place_entity(number).name
+def left_out(
+    packages: int, results: Mapping[str, Result], before: Planned | None
+) -> tuple[int, ...]:
+    """Return the packages whose places are filled by later ones.
+
+    One that has no result has not come yet, whatever an online context before this one held.
+
+    Args:
+        packages: How many will come.
+        results: What became of each so far, by name of its place.
+        before: What the plan before took into account; None: there is none.
+    """
+    names = {number: place_entity(number).name for number in range(packages)}
+    came = {number: results[name].result for number, name in names.items() if name in results}
+    last = max((number for number, result in came.items() if result in STANDS), default=-1)
+    gone = {number for number in came if number > last}
+    left_before = set() if before is None else set(before.left_out)
+    return tuple(sorted(gone | (left_before & came.keys())))
+
+
+def plans_of(products: Mapping[int, str], surfaces: Mapping[Entity, Surface]) -> dict[Entity, Plan]:
+    """Return the places of packages in rows in which they touch.
+
+    Args:
+        products: What comes, by its number, in its order.
+        surfaces: Trained surface by product.
+
+    Raises:
+        ValueError: A product is wider or longer than a row.
+    """
+    models = {product: surfaces[product_entity(product)] for product in set(products.values())}
+    sizes = {product: size_of(model) for product, model in models.items()}
+    slots = planned_rows(list(products.values()), sizes, contacts_between(models))
+    return {
+        place_entity(number): Plan(product, slot.tray, slot.tray_from_product, slot.push)
+        for (number, product), slot in zip(products.items(), slots, strict=True)
+    }

@@ -11,9 +11,9 @@ pytest.importorskip("mujoco", exc_type=ImportError)
 
 from actors.palletizing import vocabulary as words
 from actors.palletizing.action import Action
-from actors.palletizing.conveyor import BeltConveyor
+from actors.palletizing.conveyor import OVERLOOKED_S, BeltConveyor, Came
 from actors.palletizing.feedback import HandlingFeedback
-from actors.palletizing.planning import RowPlanning
+from actors.palletizing.planning import RowPlanning, left_out
 from enact_dist import Entity, testing
 
 from .handled_cell import (
@@ -236,3 +236,95 @@ def test_a_tray_is_changed_when_all_of_its_places_are_closed(cell, monkeypatch):
     planned(cell)
     testing.run_once(conveyor, cell)
     assert (belt.changed, belt.runs) == (1, 1)
+
+
+def became(**results):
+    """What became of packages: `place_0="placed"`."""
+    return {
+        name.replace("_", "/"): words.Result("package/a", "milk_carton", "", one, (), "why")
+        for name, one in results.items()
+    }
+
+
+@pytest.mark.parametrize(
+    ("results", "before", "wanted"),
+    [
+        ({}, None, ()),
+        ({"place_0": "rejected"}, None, (0,)),
+        ({"place_0": "rejected", "place_1": "placed"}, None, ()),
+        ({"place_0": "rejected", "place_1": "placed"}, (0,), (0,)),
+        ({"place_0": "placed", "place_1": "skipped", "place_2": "removed"}, None, (1, 2)),
+        ({"place_1": "placed"}, (0,), ()),
+        ({"place_9": "rejected"}, None, ()),
+    ],
+    ids=["none came", "the last", "between", "was left out", "after the last that stands",
+         "has not come yet", "of no plan"],
+)  # fmt: skip
+def test_later_packages_fill_the_places_after_the_last_that_stands(results, before, wanted):
+    """A gap between others stays; one that was closed before stays closed while its package came."""
+    planned_before = None if before is None else words.Planned({}, before)
+    assert left_out(4, became(**results), planned_before) == wanted
+
+
+REQUEST = words.Request(4, "pack", "place/1", "package/b", "why")
+
+
+def came(request=None, *, stage="", outcome=None, **results):
+    """The second package, of which is known what the test says."""
+    attached = words.Attached(1, 4, stage, None, {}) if stage else None
+    return Came(words.Arrival(1, 7), request, attached, outcome, became(**results))
+
+
+@pytest.mark.parametrize(
+    ("about", "overlooked", "followed"),
+    [
+        (came(), True, False),
+        (came(replace(REQUEST, place="place/0")), False, False),
+        (came(replace(REQUEST, place="place/0"), place_0="placed"), True, False),
+        (came(REQUEST), False, True),
+        (came(replace(REQUEST, package="")), False, False),
+        (came(place_1="removed"), False, True),
+    ],
+    ids=["nothing requested", "busy", "idle", "packed", "not recognised", "closed"],
+)
+def test_a_package_that_no_request_is_about_was_overlooked(about, overlooked, followed):
+    """After a while; one that has a name is followed by perception, not by the light barrier."""
+    waited_ns = 8 + round(OVERLOOKED_S * 1e9)
+    assert about.is_overlooked(waited_ns) is overlooked
+    assert not about.is_overlooked(waited_ns - 1)
+    assert about.is_followed is followed
+
+
+PLACED = words.Outcome(4, "place", "placed", success=True, stamp_ns=9)
+
+
+@pytest.mark.parametrize(
+    ("about", "is_off"),
+    [
+        (came(), False),
+        (came(place_1="rejected"), True),
+        (came(REQUEST, stage="place"), False),
+        (came(REQUEST, stage="push"), True),
+        (came(replace(REQUEST, number=5), stage="push"), False),
+        (came(REQUEST, outcome=PLACED), True),
+        (came(REQUEST, outcome=replace(PLACED, success=False)), False),
+        (came(REQUEST, outcome=replace(PLACED, stage="grasp")), False),
+        (came(replace(REQUEST, place="place/0"), outcome=PLACED), False),
+    ],
+)
+def test_a_package_is_off_the_belt_when_it_was_put_down(about, is_off):
+    """What was lost on its way may lie on the belt: the next one waits for its result."""
+    assert about.is_off(None, ends_tray=False) is is_off
+
+
+def test_a_full_tray_is_changed_when_every_place_is_closed_and_planned_for():
+    """The plan has to know the results: the next package may still find room."""
+    plans = {Entity(f"place/{n}"): words.Plan("any", n // 2, np.eye(4)) for n in range(4)}
+    full = came(place_0="placed", place_1="rejected")
+    assert full.ends_tray(plans)
+    assert not replace(full, last=words.Arrival(0, 7)).ends_tray(plans)
+    known = words.Planned({"place/0": "placed", "place/1": "rejected"}, (1,))
+    assert full.is_off(known, ends_tray=True)
+    assert not full.is_off(words.Planned({"place/0": "placed"}, ()), ends_tray=True)
+    opened = came(place_1="rejected")
+    assert not opened.is_off(words.Planned({"place/1": "rejected"}, (1,)), ends_tray=True)
