@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from actors.palletizing.control.controller import open_controller
@@ -15,15 +14,12 @@ from actors.palletizing.handling.stages import (
     ASIDE,
     IDLE,
     RISKY,
-    Handled,
     Known,
     Stages,
-    felt,
-    frames_of,
-    stages_of,
+    handled_of,
+    progress,
 )
 from actors.palletizing.placing.finger_room import Gripper
-from actors.palletizing.placing.grasps import size_of
 from actors.palletizing.vocabulary import (
     CANDIDATE,
     CELL,
@@ -44,19 +40,15 @@ from actors.palletizing.vocabulary import (
     SYSTEM,
     Candidate,
     Outcome,
-    product_entity,
 )
 from actors.workcell.vocabulary import JOINTS
 from enact_dist import Actor, Entity, View, ViewEach, World, Write
 from enact_dist.actor.binding import joined
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
     from actors.palletizing.control.controller import ArmController
-    from actors.palletizing.placing.finger_room import Beside
-    from actors.palletizing.vocabulary import Attached, Request
+    from actors.palletizing.handling.stages import Progress
+    from actors.palletizing.vocabulary import Request
     from enact_dist import Lock
 
 
@@ -98,116 +90,50 @@ class ActionGenerator(Actor):
         request, attached = lock.get(self.request), lock.get(self.attached)
         if request is None or request.kind in IDLE:
             return
-        mine = attached if attached is not None and attached.request == request.number else None
-        result = "" if mine is None else self._result(lock, mine)
-        if mine is not None and (mine.stage == ASIDE or not result):
-            return
-        stages = self._stages(lock, request)
-        success = mine is None or mine.net.outcome(result)
-        left = stages if mine is None else stages[stages.index(mine.stage) + 1 :]
-        if success and left:
-            error = self._propose(lock, request, left, mine)
-            if not error:
-                return
-            self._end(lock, request, left[0], f"{NO_NET} {error}", success=False)
-        else:
-            error = ""
-            self._end(lock, request, "" if mine is None else mine.stage, result, success=success)
-        if not result.startswith(BY_ITSELF):
-            self._clear(lock, request, error, turned=mine is not None and mine.turned)
-
-    def _result(self, lock: Lock, attached: Attached) -> str:
-        """Return how the robot ended a net; empty while it has not."""
-        found = lock.get(self.execution)
-        return found.result if found is not None and found.net_version == attached.number else ""
-
-    def _stages(self, lock: Lock, request: Request) -> tuple[str, ...]:
         plan = lock[self.plans].get(Entity(request.place)) if request.place else None
-        return stages_of(request, plan)
-
-    def _propose(
-        self, lock: Lock, request: Request, left: tuple[str, ...], before: Attached | None
-    ) -> str:
-        """Write the candidate of the first stage that is left; return why that cannot be."""
-        known = self._known(lock, request)
-        try:
-            stages = self._ground(lock, request, known)
-            near_rad = self._near_rad(lock)
-            turned = stages.turn(left, near_rad) if before is None else before.turned
-            net = stages.net(left[0], turned=turned, near_rad=near_rad)
-            frames = frames_of(net, known)
-        except NetError as error:
-            return str(error)
-        if left[0] in RISKY:
-            flags = lock.get(self.flags, {})
-            self.expectations.before(joined(self), request, left[0], known, flags)
-        self._write(lock, Candidate(request.number, left[0], net, "", frames, turned))
-        return ""
-
-    def _clear(self, lock: Lock, request: Request, error: str, *, turned: bool) -> None:
-        """Propose to take the arm aside, so that the sensors see everything."""
-        net = aside_net(turned=turned)
-        frames = {"belt": lock[self.cell_frames]["belt"]}
-        self._write(lock, Candidate(request.number, ASIDE, net, error, frames))
-
-    def _write(self, lock: Lock, candidate: Candidate) -> None:
-        before = lock.get(self.candidate)
-        same = before is not None and (before.request, before.stage) == (
-            candidate.request,
-            candidate.stage,
-        )
-        if not same:
-            lock[self.candidate] = candidate
-
-    def _end(self, lock: Lock, request: Request, stage: str, result: str, *, success: bool) -> None:
+        at = progress(request, plan, attached, lock.get(self.execution))
+        if at is None:
+            return
+        stage, result, success, error = at.stage, at.result, at.success, ""
+        if success and at.left:
+            try:
+                self._propose(lock, request, at)
+            except NetError as why:
+                error = str(why)
+                stage, result, success = at.left[0], f"{NO_NET} {error}", False
+            else:
+                return
         before = lock.get(self.outcome)
         if before is None or before.request != request.number:
             lock[self.outcome] = Outcome(request.number, stage, result, success, time.time_ns())
+        if not at.result.startswith(BY_ITSELF):  # so that the sensors see everything
+            net = aside_net(turned=bool(at.turned))
+            frames = {"belt": lock[self.cell_frames]["belt"]}
+            self._write(lock, Candidate(request.number, ASIDE, net, error, frames))
 
-    def _known(self, lock: Lock, request: Request) -> Known:
-        """Return where what the request is about is, and no more: all of it becomes a cause."""
-        plans, sightings, place = {}, {}, Entity(request.place) if request.place else None
-        if place is not None and place in lock[self.plans]:
-            plans[request.place] = lock[self.plans][place]
-        seen = lock[self.sightings].get(Entity(request.package)) if request.package else None
-        if seen is not None:
-            grasp = lock[self.grasps].get(product_entity(seen.product))
-            if seen.frame == "belt" and grasp is not None and request.felt_m:
-                pose = felt(seen.frame_from_package, grasp, request.felt_m)
-                seen = replace(seen, frame_from_package=pose)
-            sightings[request.package] = seen
-        return Known(lock.get(self.cell_frames, {}), plans, sightings)
+    def _propose(self, lock: Lock, request: Request, at: Progress) -> None:
+        """Write the candidate of the first stage that is left.
 
-    def _ground(self, lock: Lock, request: Request, known: Known) -> Stages:
-        seen = known.sightings.get(request.package)
-        if seen is None or not seen.product:
-            raise NetError(f"{request.kind}: it is not known what {request.package or 'it'} is")
-        product = product_entity(seen.product)
-        if product not in lock[self.grasps]:
-            raise NetError(f"{request.kind}: no grasp of {seen.product} is known")
-        size_m = size_of(lock[self.surfaces][product])
-        handled = Handled(lock[self.grasps][product], size_m, self._beside(lock, request))
-        assert self._arm is not None
-        return Stages(request, handled, known, arm=self._arm.model, gripper=Gripper())
-
-    def _beside(self, lock: Lock, request: Request) -> Beside:
-        """Return what stands beside a package that is not where packages come.
-
-        One that has come by the belt has nothing beside it.
+        Raises:
+            NetError: It cannot be grounded; one line.
         """
-        if request.kind == "pack" or not {"grasp", "regrasp"} & set(self._stages(lock, request)):
-            return ()
-        plans, base_from_tray = lock[self.plans], lock[self.cell_frames]["tray"]
-        tray = plans[Entity(request.place)].tray
-        return tuple(
-            (place, base_from_tray @ flag.tray_from_product, size_of(lock[self.surfaces][product]))
-            for place, flag in lock.get(self.flags, {}).items()
-            if place != request.place and flag.verdict != "missing"
-            if (plan := plans.get(Entity(place))) is not None and plan.tray == tray
-            for product in [product_entity(flag.product)]
-        )
+        arm, joints, flags = self._arm, lock.get(self.joints), lock.get(self.flags, {})
+        assert arm is not None
+        plans, grasps, frames = lock[self.plans], lock[self.grasps], lock.get(self.cell_frames, {})
+        known = Known.about(request, frames, plans, lock[self.sightings], grasps)
+        handled = handled_of(
+            request, known,
+            grasps=grasps, surfaces=lock[self.surfaces], plans=plans, flags=flags,
+        )  # fmt: skip
+        stages = Stages(request, handled, known, arm=arm.model, gripper=Gripper())
+        near_rad = arm.posture_rad if joints is None else joints.q[-1]
+        candidate = stages.candidate(at.left, near_rad, at.turned)
+        if candidate.stage in RISKY:
+            self.expectations.before(joined(self), request, candidate.stage, known, flags)
+        self._write(lock, candidate)
 
-    def _near_rad(self, lock: Lock) -> npt.NDArray[np.float64]:
-        joints = lock.get(self.joints)
-        assert self._arm is not None
-        return self._arm.posture_rad if joints is None else joints.q[-1]
+    def _write(self, lock: Lock, candidate: Candidate) -> None:
+        before = lock.get(self.candidate)
+        new = candidate.request, candidate.stage
+        if before is None or (before.request, before.stage) != new:
+            lock[self.candidate] = candidate

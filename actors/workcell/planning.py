@@ -258,7 +258,7 @@ class Scene:
         followed: Along what the arm moves; None if `last` has no waypoints.
         obstacles: What is static.
         now: The cells that people take.
-        soon: With those that they take within `SOON_S`; `now` itself if nobody is predicted.
+        soon: With those that they take within `SOON_S`; `now` itself if no prediction is there.
         later: With all those that they take as far as is predicted.
         captured_ns: Stamp of the set, nanoseconds since 1970.
         ahead_s: How much of the path is looked at.

@@ -29,6 +29,9 @@ import numpy as np
 from actors.palletizing.handling.grounding import PUSH_GAP_M, Job, easier_turn, ground
 from actors.palletizing.handling.nets import NetError
 from actors.palletizing.placing.finger_room import Gripper, open_m
+from actors.palletizing.placing.grasps import size_of
+from actors.palletizing.vocabulary import Candidate, product_entity
+from enact_dist import Entity
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -36,11 +39,13 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from actors.geometry.arms.joint_paths import Arm
+    from actors.geometry.shapes import Surface
     from actors.palletizing.handling.nets import Execution, Net
     from actors.palletizing.placing.finger_room import Beside, Grasp
     from actors.palletizing.placing.rows import Slot
     from actors.palletizing.vocabulary import (
         Attached,
+        Deviation,
         GripCommand,
         GripState,
         Outcome,
@@ -155,6 +160,11 @@ def gap_before(short_m: float) -> float:
     return max(PUSH_GAP_M, short_m)
 
 
+def ended(attached: Attached, doing: Execution | None) -> str:
+    """Return how the robot ended a net; empty while it has not."""
+    return doing.result if doing is not None and doing.net_version == attached.number else ""
+
+
 def way_aside(attached: Attached | None, doing: Execution | None) -> tuple[int, str]:
     """Return the number of the net that takes the arm aside and how it ended; (0, "") if none.
 
@@ -162,7 +172,7 @@ def way_aside(attached: Attached | None, doing: Execution | None) -> tuple[int, 
     """
     if attached is None or doing is None or attached.stage != ASIDE:
         return 0, ""
-    return attached.number, doing.result if doing.net_version == attached.number else ""
+    return attached.number, ended(attached, doing)
 
 
 def is_on_belt_first(request: Request, outcome: Outcome) -> bool:
@@ -189,6 +199,46 @@ def stages_of(request: Request, plan: Plan | None) -> tuple[str, ...]:
     }.get(request.kind, ())
 
 
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far the robot is with a request.
+
+    Attributes:
+        left: The stages that are left, in their order.
+        stage: The last one that has ended; empty: none was begun.
+        result: How it ended.
+        success: Whether that is what it was for.
+        turned: Whether the hand is turned round for it; None: none was begun.
+    """
+
+    left: tuple[str, ...]
+    stage: str = ""
+    result: str = ""
+    success: bool = True
+    turned: bool | None = None
+
+
+def progress(
+    request: Request, plan: Plan | None, attached: Attached | None, doing: Execution | None
+) -> Progress | None:
+    """Return how far the robot is; None while it is at a stage, or goes aside after the last one.
+
+    Args:
+        request: What is asked for.
+        plan: Of its place; None if it is about none.
+        attached: The net that the robot executes, for whatever request.
+        doing: How far it is with its net.
+    """
+    stages = stages_of(request, plan)
+    if attached is None or attached.request != request.number:
+        return Progress(stages)
+    result, stage = ended(attached, doing), attached.stage
+    if stage == ASIDE or not result:
+        return None
+    left, success = stages[stages.index(stage) + 1 :], attached.net.outcome(result)
+    return Progress(left, stage, result, success, attached.turned)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Known:
     """Where everything is.
@@ -202,6 +252,38 @@ class Known:
     cell: Mapping[str, F64]
     plans: Mapping[str, Plan]
     sightings: Mapping[str, Sighting]
+
+    @classmethod
+    def about(
+        cls,
+        request: Request,
+        cell: Mapping[str, F64],
+        plans: Mapping[Entity, Plan],
+        sightings: Mapping[Entity, Sighting],
+        grasps: Mapping[Entity, Grasp],
+    ) -> Known:
+        """Return where what a request is about is, and no more: all of it becomes a cause.
+
+        Args:
+            request: What is asked for.
+            cell: base_from_entity by name.
+            plans: By place.
+            sightings: By package.
+            grasps: By product; along its grasp a package may have been felt beside where it was
+                seen on the belt.
+        """
+        plan = plans.get(Entity(request.place)) if request.place else None
+        seen = sightings.get(Entity(request.package)) if request.package else None
+        if seen is not None and seen.frame == "belt" and request.felt_m:
+            grasp = grasps.get(product_entity(seen.product))
+            if grasp is not None:
+                pose = felt(seen.frame_from_package, grasp, request.felt_m)
+                seen = dataclasses.replace(seen, frame_from_package=pose)
+        return cls(
+            cell,
+            {} if plan is None else {request.place: plan},
+            {} if seen is None else {request.package: seen},
+        )
 
     def __call__(self, entity: str) -> F64:
         """Return base_from_entity, (4, 4), metres.
@@ -232,6 +314,52 @@ class Handled:
     beside: Beside = ()
 
 
+def handled_of(
+    request: Request,
+    known: Known,
+    *,
+    grasps: Mapping[Entity, Grasp],
+    surfaces: Mapping[Entity, Surface],
+    plans: Mapping[Entity, Plan],
+    flags: Mapping[str, Deviation],
+) -> Handled:
+    """Return the package of a request, and what stands beside it where a hand goes down to it.
+
+    Args:
+        request: What is asked for.
+        known: Where what it is about is.
+        grasps: By product.
+        surfaces: By product, those of neighbours included.
+        plans: By place, those of neighbours included.
+        flags: The last verdict on each place, by its name.
+
+    Raises:
+        NetError: It is not known what the package is, or how it is held; one line.
+    """
+    seen = known.sightings.get(request.package)
+    if seen is None or not seen.product:
+        raise NetError(f"{request.kind}: it is not known what {request.package or 'it'} is")
+    product, plan = product_entity(seen.product), known.plans.get(request.place)
+    if product not in grasps:
+        raise NetError(f"{request.kind}: no grasp of {seen.product} is known")
+    handled = Handled(grasps[product], size_of(surfaces[product]))
+    # What has come by the belt has nothing beside it.
+    is_taken = {"grasp", "regrasp"} & set(stages_of(request, plan))
+    if request.kind == "pack" or not is_taken or plan is None:
+        return handled
+    beside = tuple(
+        (
+            place,
+            known.cell["tray"] @ flag.tray_from_product,
+            size_of(surfaces[product_entity(flag.product)]),
+        )
+        for place, flag in flags.items()
+        if place != request.place and flag.verdict != "missing"
+        if (other := plans.get(Entity(place))) is not None and other.tray == plan.tray
+    )
+    return dataclasses.replace(handled, beside=beside)
+
+
 class Stages:
     """Grounds the stages of one request."""
 
@@ -253,7 +381,27 @@ class Stages:
             product=seen.product if (seen := known.sightings.get(request.package)) else "",
             gap_m=gap_before(request.short_m if request.kind == "push_again" else 0.0),
         )
-        self._known, self._arm, self._gripper = known, arm, gripper
+        self._request, self._known = request, known
+        self._arm, self._gripper = arm, gripper
+
+    def candidate(
+        self, left: tuple[str, ...], near_rad: F64, turned: bool | None = None
+    ) -> Candidate:
+        """Return the first stage that is left, grounded.
+
+        Args:
+            left: The stages that are left.
+            near_rad: (7,), where the arm is.
+            turned: Whether the hand is turned round; None: as it can go through all of them.
+
+        Raises:
+            NetError: It cannot be grounded; one line.
+        """
+        if turned is None:
+            turned = self.turn(left, near_rad)
+        net = self.net(left[0], turned=turned, near_rad=near_rad)
+        frames = frames_of(net, self._known)
+        return Candidate(self._request.number, left[0], net, "", frames, turned)
 
     def net(self, stage: str, *, turned: bool, near_rad: F64) -> Net:
         """Return the net of a stage.
