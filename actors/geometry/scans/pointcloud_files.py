@@ -9,13 +9,14 @@ and a line on the terminal, or with memory it never wrote; the header is judged 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from actors.geometry.files import InputFileError, existing_file
 from actors.geometry.open3d_on_use import open3d
 from actors.geometry.scans.cloud_headers import checked_header
+from actors.geometry.surfaces.surface_distance import Mesh, samples_on
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -102,29 +103,6 @@ def read_cloud(path: Path, *, asked: str = "a point cloud (PCD or PLY)") -> Clou
     )
 
 
-def points_on_mesh(
-    vertices_m: npt.NDArray[np.float64], triangles: npt.NDArray[np.integer[Any]], count: int
-) -> npt.NDArray[np.float64]:
-    """Draw points evenly on a surface; the same ones for the same mesh.
-
-    Args:
-        vertices_m: (N, 3).
-        triangles: (K, 3), indices of vertices.
-        count: How many points.
-
-    Returns:
-        (count, 3), in the frame of the vertices.
-    """
-    random = np.random.default_rng(0)
-    a, b, c = (vertices_m[triangles[:, corner]] for corner in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    chosen = random.choice(len(triangles), size=count, p=area / area.sum())
-    u, v = np.sqrt(random.random((count, 1))), random.random((count, 1))
-    drawn: npt.NDArray[np.float64] = a[chosen] * (1.0 - u) + u * (1.0 - v) * b[chosen]
-    drawn += u * v * c[chosen]
-    return drawn
-
-
 def _decoded(
     path: Path, *, mesh: bool
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8] | None, bool]:
@@ -135,7 +113,7 @@ def _decoded(
             read = o3d.io.read_triangle_mesh(path)
             vertices_m, triangles = np.asarray(read.vertices), np.asarray(read.triangles)
             if triangles.size and triangles.min() >= 0 and triangles.max() < len(vertices_m):
-                return points_on_mesh(vertices_m, triangles, MESH_SAMPLES), None, True
+                return samples_on(Mesh(vertices_m, triangles), MESH_SAMPLES), None, True
         cloud = o3d.io.read_point_cloud(path)
     colours = None
     if cloud.has_colors():
