@@ -30,10 +30,13 @@ from actors.workcell.vocabulary import (
     Safety,
     Speed,
 )
+from actors.workcell.watch import MISFIT
 from enact_dist import Actor, View, World, Write
 
 if TYPE_CHECKING:
-    from actors.workcell.vocabulary import ArmModel, Joints, Path
+    from collections.abc import Mapping
+
+    from actors.workcell.vocabulary import ArmModel, CameraState, Grid, Joints, Path
     from enact_dist import Lock
 
 MISFITS_MAX = 2
@@ -59,6 +62,10 @@ class Verdict:
     limit_m_s: float
     cause: str
     reason: str
+
+    def share_of(self, nominal_m_s: float) -> float:
+        """Return the share of a speed that is allowed, 0 to 1."""
+        return min(1.0, self.limit_m_s / nominal_m_s) if self.limit_m_s else 0.0
 
 
 def judged(
@@ -87,7 +94,7 @@ def judged(
         without_path: Why there is no path; empty if there is one.
     """
     if misfits > MISFITS_MAX:
-        cause = "the background no longer fits"
+        cause = f"the {MISFIT}"
         return Verdict("fault", 0.0, cause, f"{cause} in {misfits} cameras")
     if age_s < -FUTURE_NS / 1e9:
         cause = "the cameras' clock is ahead"
@@ -173,50 +180,46 @@ class SpeedControl(Actor):
                 f" {BRAKING_M_S2:g} m/s², and no distance may count on more"
             )
         hull, captured_ns = lock[self.hull], lock.stamp_ns(self.hull)
-        joints, path = lock.get(self.joints), lock.get(self.path)
-        states = lock.get(self.cameras, {})
+        joints, path, model = lock.get(self.joints), lock.get(self.path), lock.get(self.model)
         age_s = (self.now_ns() - captured_ns) / 1e9
         reaction = self._measured(age_s)
         joints_ns = int(joints.stamp_ns[-1]) if joints is not None else 0
-        nominal_m_s = self._nominal_m_s(lock.get(self.model), path, joints)
+        states_ns = -math.inf if lock.is_null(self.cameras) else lock.stamp_ns(self.cameras)
+        misfits, without = troubles_of(lock.get(self.cameras, {}))
+        to_sides_m = math.inf
+        if self.open_sides:
+            to_sides_m = distance_to_sides_m(lock.get(self.grid), model, joints)
+        nominal_m_s = self._nominal_m_s(model, path, joints)
         human_m_s, by_whom = self.people_m_s(lock)
-        separation = Separation(
-            reaction_s=reaction.reaction_s,
-            human_m_s=human_m_s,
-            braking_m_s2=self.braking_m_s2,
-            intrusion_m=self.intrusion_m,
-            uncertainty_m=self.uncertainty_m,
-        )
         verdict = judged(
-            nearest_m=min(hull.nearest_m, self._to_sides_m(lock)),
+            nearest_m=min(hull.nearest_m, to_sides_m),
             age_s=age_s,
             joints_age_s=max(0.0, (captured_ns - joints_ns) / 1e9),
             nominal_m_s=nominal_m_s,
-            separation=separation,
-            latest_s=self.latest_s,
-            states_age_s=(
-                math.inf
-                if lock.is_null(self.cameras)
-                else max(0.0, (captured_ns - lock.stamp_ns(self.cameras)) / 1e9)
+            separation=Separation(
+                reaction_s=reaction.reaction_s,
+                human_m_s=human_m_s,
+                braking_m_s2=self.braking_m_s2,
+                intrusion_m=self.intrusion_m,
+                uncertainty_m=self.uncertainty_m,
             ),
-            misfits=sum(state.trouble == "background no longer fits" for state in states.values()),
+            latest_s=self.latest_s,
+            states_age_s=max(0.0, (captured_ns - states_ns) / 1e9),
+            misfits=misfits,
             without_path=_missing(path),
         )
-        blind = [name for name, state in sorted(states.items()) if not state.alive]
-        without = f"; without {', '.join(blind)}" if blind else ""
-        people = f"; {by_whom}" if by_whom else ""
         lock[self.speed] = Speed(
-            scale=min(1.0, verdict.limit_m_s / nominal_m_s) if verdict.limit_m_s else 0.0,
+            scale=verdict.share_of(nominal_m_s),
             limit_m_s=verdict.limit_m_s,
             nearest_m=hull.nearest_m,
-            reason=verdict.reason + people + without,
+            reason="; ".join(filter(None, (verdict.reason, by_whom, without))),
             valid_ms=1e3 * reaction.valid_s,
             captured_ns=captured_ns,
             joints_ns=joints_ns,
             human_m_s=human_m_s,
         )
         last = lock.get(self.safety)
-        said = verdict.state, verdict.cause + without
+        said = verdict.state, verdict.cause + (without and f"; {without}")
         if last is None or (last.state, last.reason) != said:
             lock[self.safety] = Safety(*said, since_ns=captured_ns)
 
@@ -231,18 +234,6 @@ class SpeedControl(Actor):
         self._reaction.seen(age_s)
         return self._reaction
 
-    def _to_sides_m(self, lock: Lock) -> float:
-        """Return how far the arm is from the sides of the watched volume, if these are open."""
-        if not self.open_sides:
-            return math.inf
-        grid, model, joints = lock.get(self.grid), lock.get(self.model), lock.get(self.joints)
-        if grid is None or model is None or joints is None:
-            return 0.0
-        boxes = bounds(capsules_at(model, joints.q[-1])[0])[..., :2]
-        high_m = grid.origin_m[:2] + grid.voxel_m * np.array(grid.shape[:2])
-        low = (boxes[:, 0] - grid.origin_m[:2]).min()
-        return float(min(low, (high_m - boxes[:, 1]).min()))
-
     def _nominal_m_s(
         self, model: ArmModel | None, path: Path | None, joints: Joints | None
     ) -> float:
@@ -254,6 +245,23 @@ class SpeedControl(Actor):
             self._speeds = path.identity, PathSpeeds(model, line, nominal_m_s=NOMINAL_M_S)
         speeds = self._speeds[1]
         return speeds.nominal_m_s(speeds.path.nearest_rad(joints.q[-1]), AHEAD_S)
+
+
+def troubles_of(states: Mapping[str, CameraState]) -> tuple[int, str]:
+    """Return how many cameras no longer fit their background, and which do not see, in words."""
+    misfits = sum(state.trouble == MISFIT for state in states.values())
+    blind = [name for name, state in sorted(states.items()) if not state.alive]
+    return misfits, f"without {', '.join(blind)}" if blind else ""
+
+
+def distance_to_sides_m(grid: Grid | None, model: ArmModel | None, joints: Joints | None) -> float:
+    """Return how far the arm is from the sides of the watched volume; 0 while that is not known."""
+    if grid is None or model is None or joints is None:
+        return 0.0
+    boxes = bounds(capsules_at(model, joints.q[-1])[0])[..., :2]
+    high_m = grid.origin_m[:2] + grid.voxel_m * np.array(grid.shape[:2])
+    low = (boxes[:, 0] - grid.origin_m[:2]).min()
+    return float(min(low, (high_m - boxes[:, 1]).min()))
 
 
 def _missing(path: Path | None) -> str:

@@ -13,7 +13,7 @@ from actors.geometry.capsules import bounds
 from actors.geometry.separation import Separation
 from actors.workcell.motion import NOMINAL_M_S, ROBOT_S
 from actors.workcell.simulation.arm import ARM, HOME_RAD
-from actors.workcell.speed import SpeedControl, judged
+from actors.workcell.speed import SpeedControl, Verdict, distance_to_sides_m, judged, troubles_of
 from actors.workcell.vocabulary import (
     CAMERA_STATES,
     GRID,
@@ -81,6 +81,39 @@ def test_verdict_follows_from_what_is_known(changes, state, text):
 def test_worse_causes_come_first():
     """A fault is not hidden by someone who is near."""
     assert judged(**{**SOUND, "misfits": 8, "nearest_m": 0.0, "age_s": 9.0}).state == "fault"
+
+
+@pytest.mark.parametrize(
+    ("limit_m_s", "share"), [(0.0, 0.0), (0.5, 0.25), (2.0, 1.0), (math.inf, 1.0)]
+)
+def test_share_of_the_nominal_speed_is_never_more_than_all_of_it(limit_m_s, share):
+    """Without a limit the robot goes as fast as its path lets it; at rest the share is exactly 0."""
+    assert Verdict("slow", limit_m_s, "", "").share_of(2.0) == share
+
+
+def test_troubles_are_counted_and_named():
+    """A camera that misfits sees all the same; one that is stuck does not."""
+    states = {
+        "camera/2": CameraState(False, 0, 0, "stuck"),
+        "camera/1": CameraState(True, 0, 0, "background no longer fits"),
+        "camera/0": CameraState(False, 0, 0, "silent"),
+        "camera/3": CameraState(True, 0, 0, ""),
+    }
+    assert troubles_of(states) == (1, "without camera/0, camera/2")
+    assert troubles_of({}) == (0, "")
+
+
+@pytest.mark.parametrize(("side", "sign"), [(0, -1.0), (0, 1.0), (1, -1.0), (1, 1.0)])
+def test_distance_to_the_sides_is_to_the_nearest_one(side, sign):
+    """Each side of the volume counts when the arm is nearest to it; what is not known counts as 0."""
+    boxes = bounds(capsules_at(ARM, HOME_RAD)[0])[..., :2]
+    end_m = boxes[:, 0].min(0) if sign < 0.0 else boxes[:, 1].max(0)
+    low_m = np.array([-5.0, -5.0, 0.0])
+    low_m[side] = end_m[side] - (0.3 if sign < 0.0 else 9.7)
+    joints = Joints(np.tile(HOME_RAD, (2, 1)), np.zeros((2, 7)), np.arange(2))
+    grid = Grid(low_m, 0.1, (100, 100, 20))
+    assert distance_to_sides_m(grid, ARM, joints) == pytest.approx(0.3)
+    assert distance_to_sides_m(None, ARM, joints) == distance_to_sides_m(grid, ARM, None) == 0.0
 
 
 def hull(nearest_m):
