@@ -135,3 +135,11 @@ def test_mesh_is_refused_when_its_faces_are_cut_off(tmp_path):
     path.write_bytes(content[:-30])
 
     assert "cut off" in refused(path)
+
+
+def test_mesh_without_an_area_is_refused(tmp_path):
+    """A program that scales by 0 writes one: there is no point to draw that says anything."""
+    path = tmp_path / "flat.ply"
+    path.write_bytes(ply_bytes(np.full((3, 3), 0.1), np.array([[0, 1, 2]])))
+
+    assert "all points coincide" in refused(path)
