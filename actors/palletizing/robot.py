@@ -32,8 +32,9 @@ from enact_dist import Actor, View, World, Write
 
 if TYPE_CHECKING:
     from actors.palletizing.handling.nets import Execution
-    from actors.palletizing.vocabulary import Control
+    from actors.palletizing.vocabulary import Attached, Control
     from enact_dist import Lock
+    from enact_dist.actor.outcome import Outcome
 
 LEASE_S: Final = 2.0
 OPENING_S: Final = 5.0
@@ -176,33 +177,48 @@ class RobotJoints(Actor):
         elif loop.execution not in (None, self._told) and not loop.execution.result:
             lock[self.execution] = self._told = loop.execution
         else:
-            self._tell_unexecuted(lock, begun_here=loop.execution is not None)
+            over = unexecuted(
+                lock.get(self.net),
+                lock.get(self.net_outcome),
+                lock.get(self.execution),
+                version=lock.version(self.net),
+                begun_here=loop.execution is not None,
+            )
+            if over is not None:
+                lock[self.execution] = over
 
-    def _tell_unexecuted(self, lock: Lock, *, begun_here: bool) -> None:
-        """Say of a net that was taken, and that no process executes any more, that it is over.
 
-        An earlier process may have begun it; or `Robot` failed or was stopped before the loop got
-        it.  Without a result the cell would stand still.
-        """
-        before, attached = lock.get(self.execution), lock.get(self.net)
-        if before is not None and not before.result:
-            if not begun_here:
-                lock[self.execution] = interrupted(before)
-            return
-        taken = lock.get(self.net_outcome)
-        if taken is None or attached is None or taken.state == "taken":
-            return
-        if taken.version != lock.version(self.net):
-            return  # of an older net; this one is still to be taken
-        if before is not None and before.net_version == attached.number:
-            return
-        if taken.state in {"interrupted", "done"}:
-            unbegun = ended_without_step(attached, before, None, "")
-            lock[self.execution] = interrupted(unbegun)
-        else:
-            unbegun = ended_without_step(attached, before, None, f"braked:{taken.state}")
-            step = TraceStep(unbegun.primitive, unbegun.result, 0.0, taken.text)
-            lock[self.execution] = replace(unbegun, trace=(step,))
+def unexecuted(
+    attached: Attached | None,
+    taken: Outcome | None,
+    before: Execution | None,
+    *,
+    version: int,
+    begun_here: bool,
+) -> Execution | None:
+    """Return how a net ends that was taken, and that no process executes any more; None if none.
+
+    An earlier process may have begun it; or `Robot` failed or was stopped before the loop got it.
+    Without a result the cell would stand still.
+
+    Args:
+        attached: The newest net.
+        taken: What became of the version of `NET` that was taken last.
+        before: What is published of the robot.
+        version: Of the newest net: one that was not taken yet does not end.
+        begun_here: The loop of this process has a net.
+    """
+    if before is not None and not before.result:
+        return None if begun_here else interrupted(before)
+    if taken is None or attached is None or taken.state == "taken" or taken.version != version:
+        return None
+    if before is not None and before.net_version == attached.number:
+        return None
+    if taken.state in {"interrupted", "done"}:
+        return interrupted(ended_without_step(attached, before, None, ""))
+    unbegun = ended_without_step(attached, before, None, f"braked:{taken.state}")
+    step = TraceStep(unbegun.primitive, unbegun.result, 0.0, taken.text)
+    return replace(unbegun, trace=(step,))
 
 
 def _is(found: Execution | None, published: Execution) -> bool:

@@ -14,7 +14,8 @@ from actors.palletizing import robot
 from actors.palletizing.control.controller import ArmMeasured, ControllerError, GripperMeasured
 from actors.palletizing.control.execution import Grip
 from actors.palletizing.gripper import Gripper
-from actors.palletizing.robot import Robot, RobotJoints
+from actors.palletizing.handling.nets import Execution
+from actors.palletizing.robot import Robot, RobotJoints, unexecuted
 from actors.palletizing.vocabulary import (
     COMMAND,
     CONTROL,
@@ -475,3 +476,25 @@ def test_robot_without_its_arm_says_what_is_missing(trial, monkeypatch):
 
     with pytest.raises(RuntimeError, match='process = "robot"'):
         testing.run_once(Robot(trial.address), trial.cell)
+
+
+def execution(number, result):
+    return Execution("trial", number, "drift", 7, (), result, np.zeros(6), 0.07, np.eye(4))
+
+
+@pytest.mark.parametrize(
+    ("before", "taken", "begun_here", "result"),
+    [
+        (None, Outcome("taken", 4, 1), False, None),
+        (None, Outcome("failed", 4, 1), True, "braked:failed"),
+        (execution(1, "done"), Outcome("done", 4, 1), True, "interrupted:drift"),
+        (execution(2, "done"), Outcome("done", 4, 1), True, None),
+        (execution(1, ""), None, False, "interrupted:drift"),
+        (execution(1, ""), None, True, None),
+    ],
+)
+def test_a_net_that_no_process_executes_is_over(before, taken, begun_here, result):
+    """Only one that was taken ends without a step, by the name of what became of it."""
+    net_of = Attached(2, 1, "push", endless(), {})
+    over = unexecuted(net_of, taken, before, version=4, begun_here=begun_here)
+    assert (over and over.result) == result
