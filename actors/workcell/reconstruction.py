@@ -42,12 +42,14 @@ from actors.workcell.vocabulary import (
 from enact_dist import Actor, Together, View, ViewEach, World, Write
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Container, Iterable, Mapping
 
     import numpy.typing as npt
 
+    from actors.geometry.hull.refinement import Refined
     from actors.geometry.hull.visibility import CameraTable
-    from enact_dist import Lock
+    from actors.workcell.vocabulary import ArmModel
+    from enact_dist import Entity, Lock
 
     F64 = npt.NDArray[np.float64]
 
@@ -127,7 +129,7 @@ class Reconstruction(Actor):
         self._made_of: object = None
         self._made: tuple[Refinement, VoxelBlocks] | None = None
         self._last_ns = self._written_ns = 0
-        self._checksums: dict[str, deque[int]] = {}
+        self._images = NewImages()
 
     @classmethod
     def of(
@@ -178,31 +180,24 @@ class Reconstruction(Actor):
         if fresh and now_ns - stamp_ns > self.late_s * 1e9:
             return
         refinement, blocks = self._prepared(lock)
-        given = self._given(lock[self.silhouettes])
-        elapsed_s = (stamp_ns - self._last_ns) / 1e9 if self._last_ns else math.inf
+        found = dict(zip(self._names, lock[self.silhouettes], strict=True))
+        given = self._images.of(found, or_repeated=not self.stuck)
         seen = [given.get(name) for name in self._names]
-        found = refinement.step(
+        arm: F64 | None = np.empty((0, 7))
+        if self.robot:
+            arm = arm_at(lock.get(self.model), lock.get(self.joints), stamp_ns)
+        occupied = refinement.step(
             [one.packed if one else None for one in seen],
-            self._arm(lock, stamp_ns),
-            elapsed_s,
+            arm,
+            (stamp_ns - self._last_ns) / 1e9 if self._last_ns else math.inf,
             [one.shade if one else None for one in seen],
         )
         self._last_ns, self._written_ns = stamp_ns, now_ns
-        if self.robot and len(found.rows) > VOXELS_MAX:
-            found = found.limited(VOXELS_MAX)
-        nearest, clearance_m = found.nearest, found.clearance_m - np.float32(self._moved_m)
-        lock[self.hull] = Hull(
-            voxels=blocks.indices(found.rows),
-            clearance_m=clearance_m,
-            tight=found.tight,
-            component=found.component,
-            counts=found.counts,
-            cameras=tuple(name for name in self._names if name in given),
-            nearest_m=float(clearance_m[nearest]) if nearest >= 0 else math.inf,
-            nearest_voxel=nearest,
-        )
+        if self.robot and len(occupied.rows) > VOXELS_MAX:
+            occupied = occupied.limited(VOXELS_MAX)
+        lock[self.hull] = hull_of(occupied, blocks, tuple(given), self._moved_m)
         if lock.get(self.wanted, 0) > 0:
-            lock[self.raw_hull] = blocks.indices(found.raw)
+            lock[self.raw_hull] = blocks.indices(occupied.raw)
 
     def tables(
         self, blocks: VoxelBlocks, calibrations: list[Calibration], boxes: list[F64]
@@ -217,19 +212,13 @@ class Reconstruction(Actor):
             ValueError: Grid or calibration of a camera are missing or wrong, or an obstacle has a
                 surface and no boxes; in one line.
         """
-        found = {entity.name: one for entity, one in lock[self.calibrations].items()}
+        of_camera = {entity.name: one for entity, one in lock[self.calibrations].items()}
         of_obstacle = dict(lock[self.boxes].items())
-        bare = set(lock[self.surfaces]) - set(of_obstacle)
-        missing = [name for name in self._names if name not in found]
-        if lock.is_null(self.grid) or missing:
-            what = f"calibration of {', '.join(missing)}" if missing else "workspace/grid"
-            raise ValueError(f"{what} is null; write it before the first image")
-        if bare:
-            raise ValueError(
-                f"{', '.join(sorted(one.name for one in bare))}: a surface without boxes; cameras"
-                " would be taken to see through it, so write its boxes, too"
-            )
-        calibrations = [found[name] for name in self._names]
+        check_known(
+            self._names, of_camera, of_obstacle, lock[self.surfaces],
+            has_grid=not lock.is_null(self.grid),
+        )  # fmt: skip
+        calibrations = [of_camera[name] for name in self._names]
         boxes = [of_obstacle[entity] for entity in sorted(of_obstacle, key=str)]
         made_of = (lock.version(self.grid), _bytes_of(calibrations, boxes))
         if self._made is not None and made_of == self._made_of:
@@ -254,32 +243,92 @@ class Reconstruction(Actor):
         """The names of the cameras, in the order of their silhouettes."""
         return [str(view.entity) for view in self.silhouettes.requests]
 
-    def _given(self, found: tuple[Silhouette | None, ...]) -> dict[str, Silhouette]:
-        """Return the silhouettes that come of a new image, by name of the camera.
 
-        Raises:
-            ValueError: One is not of the size of its camera's calibration.
+class NewImages:
+    """Tells silhouettes of new images from stand-ins, and from those of images that came before."""
+
+    def __init__(self) -> None:
+        self._checksums: dict[str, deque[int]] = {}
+
+    def of(
+        self, found: Mapping[str, Silhouette | None], *, or_repeated: bool = False
+    ) -> dict[str, Silhouette]:
+        """Return the silhouettes of a set that come of new images, by name of the camera.
+
+        Args:
+            found: Of each camera, in their order; None: it gave none.
+            or_repeated: An image that equals one of the last four counts as new, too.
         """
         given = {}
-        for name, silhouette in zip(self._names, found, strict=True):
+        for name, silhouette in found.items():
             if silhouette is None or silhouette.stand_in:
                 continue
             checksum = silhouette.image_checksum
             before = self._checksums.setdefault(name, deque(maxlen=IMAGES_COMPARED))
-            again = self.stuck and checksum and checksum in before
-            before.append(checksum)
-            if not again:
+            if or_repeated or not checksum or checksum not in before:
                 given[name] = silhouette
+            before.append(checksum)
         return given
 
-    def _arm(self, lock: Lock, stamp_ns: int) -> F64 | None:
-        """Return the robot's capsules at the exposure; None if they are not known."""
-        if not self.robot:
-            return np.empty((0, 7))
-        if lock.is_null(self.model) or lock.is_null(self.joints):
-            return None
-        q_rad = joints_at(lock[self.joints], stamp_ns)
-        return None if q_rad is None else capsules_at(lock[self.model], q_rad)[0]
+
+def check_known(
+    cameras: Iterable[str],
+    calibrations: Container[str],
+    boxes: Container[Entity],
+    surfaces: Iterable[Entity],
+    *,
+    has_grid: bool,
+) -> None:
+    """Refuse a cell of which too little is known.
+
+    Args:
+        cameras: Names of those that give silhouettes.
+        calibrations: Names of those that are calibrated.
+        boxes: Obstacles that have boxes.
+        surfaces: Obstacles that have a surface.
+        has_grid: Whether the voxels are known.
+
+    Raises:
+        ValueError: Something is missing; in one line.
+    """
+    missing = [name for name in cameras if name not in calibrations]
+    if missing or not has_grid:
+        what = f"calibration of {', '.join(missing)}" if missing else "workspace/grid"
+        raise ValueError(f"{what} is null; write it before the first image")
+    bare = sorted(one.name for one in surfaces if one not in boxes)
+    if bare:
+        raise ValueError(
+            f"{', '.join(bare)}: a surface without boxes; cameras"
+            " would be taken to see through it, so write its boxes, too"
+        )
+
+
+def hull_of(found: Refined, blocks: VoxelBlocks, cameras: tuple[str, ...], moved_m: float) -> Hull:
+    """Return what is occupied as a datum.
+
+    Args:
+        found: What is occupied.
+        blocks: Its voxels.
+        cameras: Names of those that have seen it.
+        moved_m: By how much less everything may be distant than it was seen.
+    """
+    nearest, clearance_m = found.nearest, found.clearance_m - np.float32(moved_m)
+    return Hull(
+        voxels=blocks.indices(found.rows),
+        clearance_m=clearance_m,
+        tight=found.tight,
+        component=found.component,
+        counts=found.counts,
+        cameras=cameras,
+        nearest_m=float(clearance_m[nearest]) if nearest >= 0 else math.inf,
+        nearest_voxel=nearest,
+    )
+
+
+def arm_at(model: ArmModel | None, joints: Joints | None, stamp_ns: int) -> F64 | None:
+    """Return the robot's capsules at an exposure, (n, 7), metres; None if they are not known."""
+    q_rad = None if joints is None else joints_at(joints, stamp_ns)
+    return None if model is None or q_rad is None else capsules_at(model, q_rad)[0]
 
 
 def joints_at(joints: Joints, stamp_ns: int) -> F64 | None:

@@ -14,7 +14,14 @@ from actors.geometry.arms.kinematics import capsules_at
 from actors.geometry.capsules import distance_between, distance_to_points, fill, outlines
 from actors.geometry.hull.silhouettes import packed
 from actors.geometry.shapes import Surface
-from actors.workcell.reconstruction import AHEAD_NS_MAX, Reconstruction, joints_at
+from actors.workcell.reconstruction import (
+    AHEAD_NS_MAX,
+    NewImages,
+    Reconstruction,
+    arm_at,
+    check_known,
+    joints_at,
+)
 from actors.workcell.simulation.arm import ARM
 from actors.workcell.simulation.room import BOXES as ROOM
 from actors.workcell.simulation.room import cameras
@@ -415,3 +422,51 @@ def test_what_is_wrong_is_one_line(cell):
     with Lock(request) as lock:
         del lock[request]
     refused(FIRST_NS + 3 * PERIOD_NS, "calibration of camera/4 is null")
+
+
+def image(checksum, *, stand_in=False):
+    return Silhouette(np.zeros((4, 1), np.uint8), 0, stand_in, checksum)
+
+
+def test_an_image_of_the_last_four_of_its_own_camera_is_not_new():
+    """Two cameras may see the same; 0 is no checksum; the fifth one back counts again."""
+    images = NewImages()
+    newest = [1, 2, 1, 3, 4, 5, 2, 0, 0]
+    new = [list(images.of({"a": image(one), "b": image(number + 1)}))
+           for number, one in enumerate(newest)]  # fmt: skip
+    assert ["a" in names for names in new] == [True, True, False, *[True] * 6]
+    assert all("b" in names for names in new)
+
+
+def test_what_is_no_image_is_no_new_image():
+    """Nothing came, or another one stands in; repeated images count where they are allowed."""
+    images = NewImages()
+    assert images.of({"a": None, "b": image(7, stand_in=True), "c": image(7)}).keys() == {"c"}
+    assert images.of({"b": image(7), "c": image(7)}).keys() == {"b"}
+    assert images.of({"c": image(7)}, or_repeated=True).keys() == {"c"}
+
+
+def test_an_arm_of_which_something_is_not_known_is_nowhere():
+    """Neither without its model nor without joints of the exposure."""
+    joints = joints_until(FIRST_NS)
+    np.testing.assert_allclose(arm_at(ARM, joints, FIRST_NS), ARM_AT_HOME)
+    assert arm_at(None, joints, FIRST_NS) is None
+    assert arm_at(ARM, None, FIRST_NS) is None
+    assert arm_at(ARM, joints, FIRST_NS + AHEAD_NS_MAX + 1) is None
+
+
+@pytest.mark.parametrize(
+    ("cameras", "surfaces", "has_grid", "why"),
+    [
+        ({"camera/0"}, (), True, "calibration of camera/1 is null"),
+        ({"camera/0", "camera/1"}, (), False, "workspace/grid is null"),
+        ({"camera/0", "camera/1"}, (0, 2), True, "obstacle/2: a surface without boxes"),
+    ],
+)
+def test_a_cell_of_which_too_little_is_known_is_refused(cameras, surfaces, has_grid, why):
+    """One line names what has to be written first."""
+    boxes = {obstacle_entity(0), obstacle_entity(1)}
+    every = ["camera/0", "camera/1"]
+    with pytest.raises(ValueError, match=why):
+        check_known(every, cameras, boxes, map(obstacle_entity, surfaces), has_grid=has_grid)
+    check_known(every, every, boxes, [obstacle_entity(1)], has_grid=True)
