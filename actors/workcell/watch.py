@@ -72,6 +72,26 @@ class Seen(NamedTuple):
             self.missed,
         )
 
+    def state(
+        self, tick_ns: int, late_s: float, alike_max: int, foreground_max: float
+    ) -> tuple[Seen, CameraState]:
+        """Return what is known after a tick, and how the camera does at it.
+
+        Args:
+            tick_ns: The tick, ns since 1970.
+            late_s: Longest time since the newest silhouette of one that is not silent.
+            alike_max: Silhouettes in a row of one image that are no trouble yet.
+            foreground_max: Greatest share of foreground that a background still fits.
+        """
+        trouble = MISFIT if self.foreground > foreground_max else ""
+        if tick_ns - self.last_ns > late_s * 1e9:
+            trouble = SILENT
+        elif self.alike > alike_max:
+            trouble = STUCK
+        alive = trouble not in {SILENT, STUCK}
+        missed = self.missed + (not alive and self.last_ns != 0)
+        return self._replace(missed=missed), CameraState(alive, self.last_ns, missed, trouble)
+
 
 class CameraWatch(Actor):
     """Tell how each calibrated camera does, at every tick.
@@ -151,25 +171,14 @@ class CameraWatch(Actor):
             newest = lock.get(view)
             if newest is not None:
                 seen = seen.after(newest, lock.stamp_ns(view))
-            trouble = self._trouble(seen, lock.tick_ns)
-            if trouble in {SILENT, STUCK} and seen.last_ns:
-                seen = seen._replace(missed=seen.missed + 1)
-            if trouble == SILENT:
+            seen, state = seen.state(lock.tick_ns, self.late_s, self.alike_max, self.foreground_max)
+            if state.trouble == SILENT:
                 silent.append(camera)
-            alive = trouble not in {SILENT, STUCK}
-            states[camera.name] = CameraState(alive, seen.last_ns, seen.missed, trouble)
-            self._seen[camera] = seen
+            states[camera.name], self._seen[camera] = state, seen
         lock[self.states] = states
         if len(silent) < len(states):
             for camera in silent:
                 lock[self.absent][camera] = lock.tick_ns
-
-    def _trouble(self, seen: Seen, tick_ns: int) -> str:
-        if tick_ns - seen.last_ns > self.late_s * 1e9:
-            return SILENT
-        if seen.alike > self.alike_max:
-            return STUCK
-        return MISFIT if seen.foreground > self.foreground_max else ""
 
 
 def _attribute(number: int) -> str:

@@ -12,7 +12,7 @@ from actors.workcell.vocabulary import (
     Silhouette,
     camera_entity,
 )
-from actors.workcell.watch import CameraWatch, StandIn
+from actors.workcell.watch import CameraWatch, Seen, StandIn
 from enact_dist import Lock, View, Write, testing
 from enact_dist.actor.running.load import make_actor
 
@@ -228,3 +228,30 @@ def test_late_silhouette_is_not_replaced(cell):
     testing.run_once(cell.stand_in, cell.cell)
 
     assert not cell.newest(2)[0].stand_in
+
+
+TICK_NS = 50 * PERIOD_NS
+ON_TIME = Seen(last_ns=TICK_NS - PERIOD_NS)
+
+
+@pytest.mark.parametrize(
+    ("seen", "trouble", "missed"),
+    [
+        (ON_TIME, "", 0),
+        (ON_TIME._replace(last_ns=TICK_NS - 2 * PERIOD_NS, missed=4), "silent", 5),
+        (Seen(), "silent", 0),
+        (ON_TIME._replace(alike=1), "", 0),
+        (ON_TIME._replace(alike=2), "stuck", 1),
+        (ON_TIME._replace(alike=2, last_ns=1), "silent", 1),
+        (ON_TIME._replace(foreground=0.31), "background no longer fits", 0),
+        (ON_TIME._replace(foreground=0.31, alike=2), "stuck", 1),
+    ],
+    ids=["sound", "late", "never came", "once alike", "alike", "alike and late", "full",
+         "full and alike"],
+)  # fmt: skip
+def test_state_names_the_worst_trouble(seen, trouble, missed):
+    """A camera that gives nothing new misses sets, once it has given any; one that misfits sees."""
+    after, state = seen.state(TICK_NS, late_s=0.15, alike_max=1, foreground_max=0.3)
+    assert (state.trouble, state.alive) == (trouble, trouble not in {"silent", "stuck"})
+    assert after == seen._replace(missed=missed)
+    assert (state.last_ns, state.sets_missed) == (seen.last_ns, missed)
