@@ -22,6 +22,8 @@ from actors.palletizing.vocabulary import (
 from enact_dist import Actor, Entity, View, ViewEach, World, Write
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from actors.palletizing.vocabulary import Question
     from enact_dist import Lock
 
@@ -80,7 +82,8 @@ class Operator(Actor):
             while self._lines is not None and not self._lines.empty():
                 self._lines.get_nowait()  # typed before this question was asked
         if self.answers:
-            choice, why = self._scripted(question, lock[self.request].tried.count("look"))
+            looks = lock[self.request].tried.count("look")
+            choice, why = scripted(question, self.answers, looks)
         else:
             choice, why = self._typed(question), ""
         if not choice:
@@ -90,14 +93,6 @@ class Operator(Actor):
         print(f"  {choice}{why}", flush=True)
         by = SCRIPT if self.answers else "terminal"
         lock[self.decision] = Decision(question.request, choice, by)
-
-    def _scripted(self, question: Question, looks: int) -> tuple[str, str]:
-        """Return the answer of the script, and why, if it is none of its own."""
-        wanted = (word for word in self.answers if word in question.choices)
-        choice = next(wanted, question.choices[0])
-        if choice == "look" and looks >= LOOKS and "stop" in question.choices:
-            return "stop", f": after {looks} looks the script looks no more"
-        return choice, ""
 
     def _typed(self, question: Question) -> str:
         """Return what was typed, if it is a choice; never wait for it, since the lock would."""
@@ -118,6 +113,21 @@ class Operator(Actor):
         seen = lock[self.sightings].get(Entity(request.package)) if request.package else None
         if seen is not None and self.hands is not None:
             self.hands.remove(seen.first_stop)
+
+
+def scripted(question: Question, answers: Sequence[str], looks: int) -> tuple[str, str]:
+    """Return the answer of a script, and why, if it is none of its own.
+
+    Args:
+        question: What is asked.
+        answers: Words in the order of preference.
+        looks: How often the cell has looked for the place.
+    """
+    wanted = (word for word in answers if word in question.choices)
+    choice = next(wanted, question.choices[0])
+    if choice == "look" and looks >= LOOKS and "stop" in question.choices:
+        return "stop", f": after {looks} looks the script looks no more"
+    return choice, ""
 
 
 def _read(lines: queue.SimpleQueue[str]) -> None:

@@ -12,6 +12,7 @@ from actors.palletizing import vocabulary as words
 from actors.palletizing.feedback import notice_of
 from actors.palletizing.handling.requests import FollowUp, Said, Situation, follow_up
 from actors.palletizing.handling.stages import TAKEN_OUT, UNRECOGNISED
+from actors.palletizing.operator import LOOKS, scripted
 from enact_dist import Entity
 
 PACKAGE = "package/a"
@@ -181,3 +182,23 @@ def test_a_notice_of_a_verdict_says_how_old_its_picture_is():
     assert judged == words.Notice("place/1: meal_tray stands as planned; go_on: sound", 9, 2.0)
     plain = notice_of(Said("place/1", None, "stop: braked:hold"), 7)
     assert plain == words.Notice("place/1: stop: braked:hold", 7, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("choices", "looks", "answer"),
+    [
+        (("regrasp", "reject", "stop"), 0, "reject"),
+        (("go_on", "removed", "stop", "look"), LOOKS, "removed"),
+        (("stop", "look"), LOOKS - 1, "look"),
+        (("stop", "look"), LOOKS, "stop"),
+        (("look",), LOOKS, "look"),
+        (("retry", "go_on"), 0, "retry"),
+    ],
+    ids=["preferred", "not a look", "looks", "looked enough", "no other way", "of none the first"],
+)
+def test_a_script_takes_the_first_word_that_can_be_answered(choices, looks, answer):
+    """It looks so often and no more, where it can stop, and says so."""
+    question = words.Question(5, "place/0: why", choices)
+    found, why = scripted(question, ("reject", "removed", "look"), looks)
+    assert found == answer
+    assert bool(why) == (answer == "stop")
