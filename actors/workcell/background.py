@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
+    from actors.workcell.vocabulary import ArmModel, Calibration, Joints
     from enact_dist import Lock
 
 log = logging.getLogger("enact.actor")
@@ -220,7 +221,10 @@ class BackgroundLearning(Actor):
             return
         if not self._learning.wants(empty_ns, lock.stamp_ns(self.background), captured_ns):
             return
-        hidden = self._arm(lock, captured_ns) if self.arm_in_view else None
+        image, hidden = lock[self.image], None
+        if self.arm_in_view:
+            known = lock.get(self.calibration), lock.get(self.model), lock.get(self.joints)
+            hidden = arm_at_rest(*known, captured_ns, image.shape[:2])
         if self.arm_in_view and hidden is None:
             if self._waited_for_ns != empty_ns:
                 self._waited_for_ns = empty_ns
@@ -230,7 +234,7 @@ class BackgroundLearning(Actor):
                 )
             return
         before = lock.get(self.background)
-        found = self._learning.learned(lock[self.image], empty_ns, captured_ns, hidden, before)
+        found = self._learning.learned(image, empty_ns, captured_ns, hidden, before)
         if found is None:
             return
         lock.put(self.background, found, stamp_ns=captured_ns)
@@ -243,20 +247,33 @@ class BackgroundLearning(Actor):
                 100.0 * found.hidden_px / found.mean[..., 0].size,
             )
 
-    def _arm(self, lock: Lock, captured_ns: int) -> npt.NDArray[np.uint8] | None:
-        """Return where the arm at rest is in the image, (H, W); None while it moves."""
-        if any(map(lock.is_null, (self.calibration, self.model, self.joints))):
-            return None
-        camera, joints = lock[self.calibration], lock[self.joints]
-        first_ns, last_ns = int(joints.stamp_ns[0]), int(joints.stamp_ns[-1])
-        known = first_ns <= captured_ns <= last_ns + RESTED_NS
-        if not known or np.abs(joints.dq).max() > RESTING_RAD_S:
-            return None
-        arm = capsules_at(lock[self.model], joints.q[-1])[0].copy()
-        arm[:, 6] += ARM_GROWN_M
-        seen_by = [(camera.camera_matrix, camera.distortion, camera.camera_from_cell)]
-        height, width = lock[self.image].shape[:2]
-        return np.asarray(fill(outlines(arm, seen_by), height, width)[0])
+
+def arm_at_rest(
+    camera: Calibration | None,
+    model: ArmModel | None,
+    joints: Joints | None,
+    captured_ns: int,
+    shape: tuple[int, int],
+) -> npt.NDArray[np.uint8] | None:
+    """Return where the arm is in an image, (H, W), grown; None if it moves or is not known.
+
+    Args:
+        camera: That took the image.
+        model: The arm.
+        joints: Its newest samples.
+        captured_ns: Exposure of the image, nanoseconds since 1970.
+        shape: Height and width of the image, pixels.
+    """
+    if camera is None or model is None or joints is None:
+        return None
+    first_ns, last_ns = int(joints.stamp_ns[0]), int(joints.stamp_ns[-1])
+    is_known = first_ns <= captured_ns <= last_ns + RESTED_NS
+    if not is_known or np.abs(joints.dq).max() > RESTING_RAD_S:
+        return None
+    arm = capsules_at(model, joints.q[-1])[0].copy()
+    arm[:, 6] += ARM_GROWN_M
+    seen_by = [(camera.camera_matrix, camera.distortion, camera.camera_from_cell)]
+    return np.asarray(fill(outlines(arm, seen_by), *shape)[0])
 
 
 class BackgroundSubtraction(Actor):

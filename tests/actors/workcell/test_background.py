@@ -9,7 +9,13 @@ from slots import put_online as put
 from actors.geometry.arms.kinematics import capsules_at
 from actors.geometry.capsules import fill, outlines
 from actors.geometry.hull.silhouettes import unpacked
-from actors.workcell.background import BackgroundLearning, BackgroundSubtraction, checksum
+from actors.workcell.background import (
+    RESTED_NS,
+    BackgroundLearning,
+    BackgroundSubtraction,
+    arm_at_rest,
+    checksum,
+)
 from actors.workcell.cameras.sources import source_of
 from actors.workcell.simulation.arm import ARM
 from actors.workcell.smart_camera import SmartCamera
@@ -195,6 +201,27 @@ def test_nothing_is_learned_where_the_arm_is_not_known_at_the_exposure(
         testing.run_once(with_arm, cell)
 
     assert seen(cell, CAMERA, BACKGROUND) is None
+
+
+@pytest.mark.parametrize(
+    ("late_ns", "dq", "is_known"),
+    [(0, 0.0, True), (RESTED_NS, 0.0, True), (RESTED_NS + 1, 0.0, False), (0, 0.01, False)],
+)
+def test_an_arm_that_rested_at_the_exposure_is_where_it_was(random, late_ns, dq, is_known):
+    """Its outline covers it with a margin; without camera, model or joints it is nowhere."""
+    newest_ns = 10 * PERIOD_NS
+    stamps = newest_ns - 10_000_000 * np.arange(29, -1, -1)
+    joints = Joints(np.tile(LEANS[0], (30, 1)), np.full((30, 7), dq), stamps)
+    known = [ROOM, ARM, joints]
+    found = arm_at_rest(*known, newest_ns + late_ns, SHAPE[:2])
+    assert (found is not None) == is_known
+    if found is not None:
+        _, there = shown(random, LEANS[0])
+        assert (found[there] > 0).all()
+        assert (found > 0).sum() > there.sum()
+    for missing in range(3):
+        partly = [None if number == missing else one for number, one in enumerate(known)]
+        assert arm_at_rest(*partly, newest_ns, SHAPE[:2]) is None
 
 
 def test_the_same_image_twice_is_one_image(cell, random):
