@@ -18,11 +18,9 @@ star of the inner one is a character that only a star can match, and its ``**`` 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Iterable
 from itertools import groupby
-from typing import TYPE_CHECKING, Final
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+from typing import Final
 
 LENGTH_MAX: Final = 200
 """Longest pattern, as long as the longest name."""

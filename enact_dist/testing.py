@@ -23,7 +23,7 @@ from weakref import WeakKeyDictionary
 
 from enact_dist.access.session import session_of
 from enact_dist.access.together import captured_versions
-from enact_dist.actor.actor import name_of
+from enact_dist.actor.actor import Actor, name_of
 from enact_dist.actor.binding import BoundActor
 from enact_dist.actor.once import Once
 from enact_dist.actor.running.doing import Doing
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
     from enact_dist.access.sets import IncompleteSet, PendingSets
-    from enact_dist.actor.actor import Actor
     from enact_dist.terms import Entity
     from enact_dist.world.cell import Cell
 

@@ -22,7 +22,7 @@ from enact_dist.errors import (
 from enact_dist.link.client.calls import CALL_S
 from enact_dist.link.client.fetch import DatumCache
 from enact_dist.retention import checked_retention
-from enact_dist.terms import Access, Entity, LockRequest, refuse_duplicates
+from enact_dist.terms import Access, Aspect, Entity, LockRequest, refuse_duplicates
 from enact_dist.wire.fingerprint import fingerprint
 from enact_dist.wire.limits import ITEMS_MAX
 
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from enact_dist.core.client.plan import Reading
     from enact_dist.core.protocol.datum import Slot
     from enact_dist.link.client.locks import CellClient
-    from enact_dist.terms import Aspect
 
 
 SETTLE_S: Final = 10.0

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Self, TypeVar
 
 from enact_dist.access.arguments import check_seconds
 from enact_dist.core.protocol.datum import Position, Slot
-from enact_dist.core.protocol.messages import Notice, Ping, Survey, Surveyed
+from enact_dist.core.protocol.messages import Notice, Ping, SlotState, Survey, Surveyed
 from enact_dist.core.state.clock import STAMP_NS_MAX, is_kept, is_older
 from enact_dist.errors import LinkError, ShardUnreachableError
 from enact_dist.link.notices import Interest, Skipped
@@ -33,7 +33,6 @@ from enact_dist.terms import Durability, Entities, Entity
 if TYPE_CHECKING:
     from types import TracebackType
 
-    from enact_dist.core.protocol.messages import SlotState
     from enact_dist.link.client.locks import CellClient
 
 POLL_S: Final = 0.1

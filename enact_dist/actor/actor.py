@@ -22,7 +22,7 @@ from __future__ import annotations
 import inspect
 import math
 import types
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Self
 
@@ -44,8 +44,6 @@ from enact_dist.terms import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from enact_dist.access.lock import Lock
 
 Declared = LockRequest[Any]

@@ -23,7 +23,7 @@ from enact_dist.actor.actor import (
 from enact_dist.actor.lock import ActorLock, OnceLock
 from enact_dist.errors import MisuseError
 from enact_dist.link.client.calls import CALL_S
-from enact_dist.terms import Entities, Entity, View, refuse_duplicates
+from enact_dist.terms import Aspect, Entities, Entity, View, refuse_duplicates
 
 if TYPE_CHECKING:
     import threading
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
     from enact_dist.core.protocol.datum import Slot
     from enact_dist.core.protocol.messages import DatumRead
-    from enact_dist.terms import Aspect
     from enact_dist.world.cell import Cell
     from enact_dist.world.context import WorldContext
 

@@ -45,7 +45,7 @@ from typing import TYPE_CHECKING, Final, Literal
 from enact_dist.actor.granted import differences
 from enact_dist.actor.running.doing import raised
 from enact_dist.actor.running.load import check_every_s, load_class, read_options
-from enact_dist.actor.uses import ActorDeclaration, declared_rights, uses_of
+from enact_dist.actor.uses import ActorDeclaration, Use, declared_rights, uses_of
 from enact_dist.config.rights import text_of_declared
 from enact_dist.config.table import suggestion
 from enact_dist.core.protocol.datum_types import newest, type_conflict
@@ -59,7 +59,6 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
     from enact_dist.actor.actor import Actor
-    from enact_dist.actor.uses import Use
     from enact_dist.config.types import CellConfig
 
 

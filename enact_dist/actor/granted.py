@@ -6,24 +6,22 @@ import itertools
 from difflib import SequenceMatcher
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from enact_dist.actor.uses import declared_rights
+from enact_dist.actor.uses import ActorDeclaration, declared_rights
 from enact_dist.config.rights import (
     DATA_LISTS,
     RIGHTS_FILE,
+    AllowTable,
     array_of,
     compiled_rights,
     text_of_declared,
 )
-from enact_dist.core.rights.rules import data_path
+from enact_dist.core.rights.rules import Rights, data_path
 from enact_dist.patterns import patterns_overlap
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from enact_dist.actor.uses import ActorDeclaration
-    from enact_dist.config.rights import AllowTable
     from enact_dist.config.types import CellConfig
-    from enact_dist.core.rights.rules import Rights
 
 SIMILAR: Final = 0.7
 """From here on (0 to 1) the names of data are similar."""

@@ -11,17 +11,13 @@ one box.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from statistics import fmean
-from typing import TYPE_CHECKING, Final
+from typing import Final
 from xml.sax.saxutils import escape, quoteattr
 
-from enact_dist.actor.uses import uses_of
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from enact_dist.actor.uses import ActorDeclaration, Use
+from enact_dist.actor.uses import ActorDeclaration, Use, uses_of
 
 CHARACTER: Final = 8.2
 """Mean width of a character in the widest of the usual bold fonts, pixels."""

@@ -15,7 +15,7 @@ import threading
 from typing import TYPE_CHECKING, Any, Final, Generic, Self, TypeVar
 
 from enact_dist.access.session import session_of
-from enact_dist.access.sets import Capture, PendingSets
+from enact_dist.access.sets import Capture, IncompleteSet, PendingSets
 from enact_dist.access.together import captured_versions
 from enact_dist.actor.report import ERROR_LENGTH_MAX, Repeated
 from enact_dist.actor.triggers import BackOff, PendingTriggers
@@ -23,17 +23,15 @@ from enact_dist.core.protocol.messages import DatumRead
 from enact_dist.errors import LinkError
 from enact_dist.link.clock import monotonic_ns
 from enact_dist.patterns import pattern_matches
-from enact_dist.terms import Entity
+from enact_dist.terms import Entity, View
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
-    from enact_dist.access.sets import IncompleteSet
     from enact_dist.access.trigger import Trigger
     from enact_dist.access.watch import Change, Watch
     from enact_dist.actor.binding import BoundActor, Watched
     from enact_dist.core.protocol.datum import Slot
-    from enact_dist.terms import View
 
 log = logging.getLogger("enact.actor")
 

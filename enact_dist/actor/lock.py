@@ -12,10 +12,10 @@ from enact_dist.access.lock import Lock
 from enact_dist.access.reads import slot_of
 from enact_dist.access.together import Together
 from enact_dist.access.writes import Asked, Writing
-from enact_dist.core.protocol.datum import Slot
+from enact_dist.core.protocol.datum import Datum, Slot
 from enact_dist.errors import LeaseLostError, MisuseError
-from enact_dist.terms import Entity, LockRequest, View, World, Write
-from enact_dist.wire.payload import decode_datum
+from enact_dist.terms import Aspect, Entity, LockRequest, LockRequestOne, View, World, Write
+from enact_dist.wire.payload import Encoded, decode_datum
 
 if TYPE_CHECKING:
     import threading
@@ -23,10 +23,7 @@ if TYPE_CHECKING:
 
     from enact_dist.access.trigger import Newer
     from enact_dist.actor.outcome import Outcome
-    from enact_dist.core.protocol.datum import Datum, Slot
     from enact_dist.core.protocol.messages import DatumRead, Item
-    from enact_dist.terms import Aspect, LockRequestOne
-    from enact_dist.wire.payload import Encoded
 
 
 R = TypeVar("R", bound=LockRequest[Any])

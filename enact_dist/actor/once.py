@@ -30,7 +30,7 @@ from enact_dist.access.lock import Lock
 from enact_dist.access.trigger import Newer
 from enact_dist.actor.inbox import Inbox
 from enact_dist.actor.outcome import Outcome, Seen, is_new
-from enact_dist.actor.running.doing import place_of
+from enact_dist.actor.running.doing import Doing, place_of
 from enact_dist.actor.triggers import BackOff
 from enact_dist.errors import (
     ChangedError,
@@ -49,7 +49,6 @@ if TYPE_CHECKING:
     from enact_dist.access.watch import Change
     from enact_dist.actor.binding import BoundActor
     from enact_dist.actor.lock import OnceLock
-    from enact_dist.actor.running.doing import Doing
 
 REFUSALS: Final = (
     LockTimeoutError,

@@ -19,16 +19,12 @@ state           of the version that the outcome names
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from enact_dist.errors import MisuseError
-from enact_dist.terms import Durability, Read, View, Write
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from enact_dist.terms import LockRequest
+from enact_dist.terms import Durability, LockRequest, Read, View, Write
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.bench.echoes.socket_echo import SocketEcho
-from enact_dist.bench.rows import FLOOR, Case
+from enact_dist.bench.rows import FLOOR, Case, Key
 from enact_dist.bench.timing import PAUSE_S, timed
 from enact_dist.errors import MisuseError
 from enact_dist.verify.daemons import KeptPorts, LineProcess
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from enact_dist.bench.echoes.zenoh_echo import ZenohEcho
-    from enact_dist.bench.rows import Key
 
 PAUSED: Final = ", paused"
 """Ends the name of a variant with pauses between the acts."""

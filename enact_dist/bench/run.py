@@ -17,13 +17,12 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from enact_dist.bench.floors import Floors
-from enact_dist.bench.place import EMBEDDED
+from enact_dist.bench.place import EMBEDDED, Place
 from enact_dist.bench.rows import FLOOR, Case, Key, Row, Timings, row_of, sample_of
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from enact_dist.bench.place import Place
 
 ROUNDS: Final = 3
 _PLAIN: Final = tuple(

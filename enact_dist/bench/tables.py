@@ -8,14 +8,12 @@ never a guess.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from typing import Any, Final, TypeAlias
 
 from enact_dist.bench.rows import FLOOR, shown_spread, shown_us
 from enact_dist.errors import MisuseError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
 
 Found: TypeAlias = dict[tuple[str, str], dict[str, Any]]
 """The rows of one run by bench and variant."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+import argparse
+from typing import Final
 
 from enact_dist.cli.arguments import READER
 from enact_dist.cli.target import cell_target
@@ -10,9 +11,6 @@ from enact_dist.cli.text.output import coloured
 from enact_dist.cli.verbs import DONE, FAILED, NOUNS, Output, Verb
 from enact_dist.errors import ConfigError
 from enact_dist.wire.texts import shown
-
-if TYPE_CHECKING:
-    import argparse
 
 _TEXTS: Final = ("subject", "text", "remedy")
 _COLOUR_INDEX: Final = {"ok": 3, "warn": 1, "FAIL": 5}

@@ -19,7 +19,8 @@ import io
 import os
 import re
 import sys
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Callable, Sequence
+from typing import Any, Final
 
 from enact_dist.cli.verbs import (
     DONE,
@@ -32,9 +33,6 @@ from enact_dist.cli.verbs import (
     told,
 )
 from enact_dist.errors import EnactError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
 
 INTERRUPTED: Final = 130
 

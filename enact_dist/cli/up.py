@@ -13,7 +13,7 @@ from enact_dist.cli.target import CELL_DEFAULT, CELL_VARIABLE, cell_config, see_
 from enact_dist.cli.text.output import coloured
 from enact_dist.cli.verbs import NOUNS, Verb, flag, option
 from enact_dist.config.table import suggestion
-from enact_dist.config.types import processes_of
+from enact_dist.config.types import CellConfig, ShardConfig, processes_of
 from enact_dist.errors import ConfigError, LinkError
 from enact_dist.link.signals import StopSignals
 
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     import argparse
     from collections.abc import Sequence
 
-    from enact_dist.config.types import CellConfig, ShardConfig
     from enact_dist.operate.supervise import Say
 
 LOOK_S: Final = 0.2

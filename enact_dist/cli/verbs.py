@@ -10,15 +10,13 @@ from __future__ import annotations
 
 import argparse
 import os
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from enact_dist.errors import ConfigError, ShardUnreachableError
 from enact_dist.wire.texts import shown
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
 
 DONE: Final = 0
 FAILED: Final = 1

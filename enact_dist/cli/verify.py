@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+import argparse
+from typing import Final
 
 from enact_dist.cli.arguments import counted, file_of, seconds, seconds_of
 from enact_dist.cli.verbs import NOUNS, OneOf, OptionGroup, Verb, flag, many, option
-
-if TYPE_CHECKING:
-    import argparse
 
 
 def minutes(text: str) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 
 from enact_dist.access.asking import explained
 from enact_dist.access.reads import is_null
-from enact_dist.access.session import unknown_aspect
+from enact_dist.access.session import Session, unknown_aspect
 from enact_dist.access.snapshot import HeldView
 from enact_dist.core.protocol.messages import CAUSE_FORK, DatumRead, Item, SlotVersion
 from enact_dist.errors import MisuseError
@@ -19,7 +19,6 @@ from enact_dist.wire.limits import ITEMS_MAX
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from enact_dist.access.session import Session
     from enact_dist.core.client.plan import Reading
     from enact_dist.core.protocol.datum import Datum, Slot
 

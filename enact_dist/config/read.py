@@ -42,9 +42,10 @@ from __future__ import annotations
 import os
 import re
 import tomllib
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from enact_dist.config.environment import with_environment
 from enact_dist.config.lines import LineLocator
@@ -58,9 +59,6 @@ from enact_dist.config.types import (
     is_wildcard,
 )
 from enact_dist.errors import ConfigError
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 _VARIABLE: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 

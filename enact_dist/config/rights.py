@@ -23,11 +23,11 @@ stand in `rights.toml` beside the file, since a shard does not import the module
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import Annotated, Final
 
 from enact_dist.config.table import TableKey
 from enact_dist.core.rights.rules import (
@@ -42,9 +42,6 @@ from enact_dist.core.rights.rules import (
 from enact_dist.errors import ConfigError
 from enact_dist.patterns import checked_pattern
 from enact_dist.terms import checked_name
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable
 
 DEFAULTS: Final = ("declared", "none")
 RIGHTS_FILE: Final = "rights.toml"

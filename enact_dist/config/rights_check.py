@@ -5,14 +5,12 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.config.rights import DATA_LISTS, NAME_MAX, NAMED_LISTS
-from enact_dist.config.table import suggestion
+from enact_dist.config.rights import DATA_LISTS, NAME_MAX, NAMED_LISTS, AllowTable
+from enact_dist.config.table import Table, suggestion
 from enact_dist.core.rights.rules import fork_path
 from enact_dist.core.shard.owners import SHARD_PREFIX
 
 if TYPE_CHECKING:
-    from enact_dist.config.rights import AllowTable
-    from enact_dist.config.table import Table
     from enact_dist.config.types import CellConfig
 
 _LOOPBACK: Final = re.compile(r"tcp/(127\.\d+\.\d+\.\d+|\[::1\]|localhost):\d+\Z")

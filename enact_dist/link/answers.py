@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Callable
+from typing import Any, Final
 
 from enact_dist.core.protocol.messages import (
+    Answer,
     Audited,
     Granted,
     Locks,
@@ -21,11 +23,6 @@ from enact_dist.core.protocol.messages import (
 from enact_dist.core.protocol.pages import bytes_in_frame
 from enact_dist.errors import ProtocolError
 from enact_dist.wire.frames import encode_parts, refusal_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from enact_dist.core.protocol.messages import Answer
 
 SURVEYED_BYTES: Final = 160
 """Estimated length of one slot in the answer to a `Survey`."""

@@ -9,7 +9,7 @@ import logging
 from typing import TYPE_CHECKING, Final, Protocol
 
 from enact_dist.core.failover.lease import Lease, Silence, kept_ns
-from enact_dist.core.protocol.messages import Refused
+from enact_dist.core.protocol.messages import Commit, Prepare, Refused
 from enact_dist.errors import StoreError
 from enact_dist.link.clock import boottime_ns
 from enact_dist.terms import Durability
@@ -17,7 +17,6 @@ from enact_dist.terms import Durability
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from enact_dist.core.protocol.messages import Commit, Prepare
     from enact_dist.core.protocol.records import Effect
     from enact_dist.core.shard.state import ShardState
 

@@ -29,15 +29,13 @@ import os
 import queue
 import sys
 import threading
+from collections.abc import Collection
 from contextlib import suppress
 from copy import copy
 from logging.handlers import QueueHandler
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from enact_dist.wire.texts import shown, shown_json
-
-if TYPE_CHECKING:
-    from collections.abc import Collection
 
 FORMATS: Final = ("text", "json")
 TEXT: Final = "%(asctime)s %(levelname)s %(name)s %(message)s"

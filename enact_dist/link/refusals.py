@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.client.lock import MultiLock
 from enact_dist.core.client.plan import Phase
-from enact_dist.core.protocol.messages import PERMISSION, Forgotten, Refused
+from enact_dist.core.protocol.messages import PERMISSION, Answer, Forgotten, Holder, Item, Refused
 from enact_dist.core.state.grants import HELD_TOO_LONG
 from enact_dist.errors import (
     SHARD_RESTARTED,
@@ -35,7 +35,6 @@ from enact_dist.errors import (
 from enact_dist.terms import ACCESSES
 
 if TYPE_CHECKING:
-    from enact_dist.core.protocol.messages import Answer, Holder, Item
     from enact_dist.link.carrier import Carrier
 
 

@@ -24,12 +24,10 @@ import socket
 import sys
 import threading
 import time
+from collections.abc import Callable
 from threading import get_ident
-from typing import TYPE_CHECKING, Any, Final, Self
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from types import FrameType
+from types import FrameType
+from typing import Any, Final, Self
 
 SAME_S: Final = 1.0
 """A signal this soon after the first is the same request: `timeout` signals its command and its

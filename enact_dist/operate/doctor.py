@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.config.read import load_config
-from enact_dist.config.types import is_locked
+from enact_dist.config.types import CellConfig, is_locked
 from enact_dist.core.state.clock import is_kept, state_of
 from enact_dist.errors import ConfigError, EnactError, ShardUnreachableError
 from enact_dist.link.memory.shared_folder import MEMORY, SHARED_FOLDER_VARIABLE
@@ -37,7 +37,6 @@ from enact_dist.operate.doctor_store import database
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterator
 
-    from enact_dist.config.types import CellConfig
     from enact_dist.world.cell import Cell
     from enact_dist.world.listings import ShardInfo
 

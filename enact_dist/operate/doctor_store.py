@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.config.types import without_password
+from enact_dist.config.types import CellConfig, without_password
 from enact_dist.errors import StoreError
 from enact_dist.operate.doctor_cell import Finding, fail, ok, warn
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from enact_dist.config.types import CellConfig
     from enact_dist.link.postgres.examine import DatabaseReport
 
 _BEING_MADE: Final = "pg_basebackup"

@@ -11,7 +11,7 @@ import threading
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from enact_dist.config.table import suggestion
-from enact_dist.core.protocol.datum import LockId
+from enact_dist.core.protocol.datum import LockId, Slot
 from enact_dist.core.protocol.messages import Cause, DatumRead, SlotState, VersionEntry
 from enact_dist.errors import MisuseError, UnknownWorldError
 from enact_dist.recording.reading import Recording
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    from enact_dist.core.protocol.datum import Slot
     from enact_dist.recording.exact import Recorded
 
 T = TypeVar("T")

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import struct
 import zlib
-from typing import TYPE_CHECKING, Final, NamedTuple, cast
+from collections.abc import Iterator
+from typing import BinaryIO, Final, NamedTuple, cast
 
 import zstandard
 from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
@@ -17,10 +18,6 @@ from mcap.opcode import Opcode
 
 from enact_dist.errors import ProtocolError
 from enact_dist.wire.limits import BODY_BYTES_MAX
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from typing import BinaryIO
 
 CHUNK_BYTES_MAX: Final = BODY_BYTES_MAX + (32 << 20)
 """A chunk ends after the commit that fills it: one largest datum and what stands before it."""

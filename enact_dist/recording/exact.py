@@ -34,20 +34,24 @@ Rule to keep: what this version does not know is refused; a change of the map ra
 from __future__ import annotations
 
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import msgpack
 
 from enact_dist.core.protocol.datum import Datum, Slot
-from enact_dist.core.protocol.messages import CAUSE_COMMIT, CAUSE_FORK, READS_MAX, DatumRead
+from enact_dist.core.protocol.messages import (
+    CAUSE_COMMIT,
+    CAUSE_FORK,
+    READS_MAX,
+    DatumRead,
+    VersionEntry,
+)
 from enact_dist.errors import ProtocolError
 from enact_dist.terms import NullReason
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from enact_dist.core.protocol.messages import VersionEntry
     from enact_dist.world.version_data import Retained, Wanted
 
 FORMAT: Final = 2

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.access.snapshot import HeldView
-from enact_dist.config.shows import GUESSED
+from enact_dist.config.shows import GUESSED, Shows
 from enact_dist.core.protocol.messages import Item
 from enact_dist.errors import ConfigError
 from enact_dist.recording.exact import recorded_of
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     import os
     from collections.abc import Iterator, Mapping
 
-    from enact_dist.config.shows import Shows
     from enact_dist.core.client.plan import Reading
     from enact_dist.recording.exact import Recorded
     from enact_dist.world.context import WorldContext

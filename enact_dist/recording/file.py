@@ -16,8 +16,8 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from mcap.writer import CompressionType, Writer
 
 from enact_dist.errors import ConfigError
-from enact_dist.recording.drawing.pictures import json_bytes, json_schema, pictures_of
-from enact_dist.recording.exact import FORMAT, encode_recorded
+from enact_dist.recording.drawing.pictures import Picture, json_bytes, json_schema, pictures_of
+from enact_dist.recording.exact import FORMAT, Recorded, encode_recorded
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
     from enact_dist.config.shows import Shows
     from enact_dist.core.protocol.messages import AspectEntry
-    from enact_dist.recording.drawing.pictures import Picture
-    from enact_dist.recording.exact import Recorded
 
 CHUNK_BYTES: Final = 8 << 20
 CHUNK_S: Final = 1.0

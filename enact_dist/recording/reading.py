@@ -11,9 +11,10 @@ from __future__ import annotations
 
 import os
 import struct
+from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import BinaryIO, Final, NamedTuple
 
 import zstandard
 from mcap.data_stream import ReadDataStream
@@ -28,15 +29,9 @@ from enact_dist.recording.chunks import (
     Chunk,
     DamagedChunkError,
 )
-from enact_dist.recording.exact import FORMATS, decode_recorded
+from enact_dist.recording.exact import FORMATS, Recorded, decode_recorded
 from enact_dist.recording.file import BEGIN_RECORD, END_RECORD, EXACT_TOPIC
 from enact_dist.terms import checked_name
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from typing import BinaryIO
-
-    from enact_dist.recording.exact import Recorded
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 METADATA_BYTES_MAX: Final = 16 << 20

@@ -17,9 +17,9 @@ import time
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.access.asking import present_ns
-from enact_dist.access.watch import Watch
-from enact_dist.config.shows import GUESSED
-from enact_dist.core.protocol.datum import Slot
+from enact_dist.access.watch import Change, Watch
+from enact_dist.config.shows import GUESSED, Shows
+from enact_dist.core.protocol.datum import LockId, Slot
 from enact_dist.errors import (
     ConfigError,
     LinkError,
@@ -47,9 +47,6 @@ if TYPE_CHECKING:
     import os
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
-    from enact_dist.access.watch import Change
-    from enact_dist.config.shows import Shows
-    from enact_dist.core.protocol.datum import LockId
     from enact_dist.core.protocol.messages import AspectEntry, VersionEntry
     from enact_dist.world.cell import Cell
 

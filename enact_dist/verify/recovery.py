@@ -24,13 +24,12 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.cli.text.output import print_json, print_table
 from enact_dist.cli.verbs import DONE, FAILED
-from enact_dist.verify.daemons import CellProcesses
+from enact_dist.verify.daemons import CellProcesses, LineProcess
 
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Callable, Sequence
 
-    from enact_dist.verify.daemons import LineProcess
 
 TTL_S: Final = 2.0
 ROUNDS: Final = 5

@@ -14,8 +14,9 @@ so what came is shown by `reprlib` (`repr` itself gives up on 500 nested lists).
 from __future__ import annotations
 
 import reprlib
+from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, get_args
+from typing import Any, Final, get_args
 
 import msgpack
 
@@ -34,9 +35,6 @@ from enact_dist.wire.limits import (
 from enact_dist.wire.long_headers import LONG_HEADER_BYTES, LongHeaders
 from enact_dist.wire.message_parts import Read, reader_of, values_of, writers_of
 from enact_dist.wire.quick_readers import quick_reader_of, safe_reader
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 
 class FrameTooLongError(ProtocolError):

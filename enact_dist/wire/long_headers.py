@@ -7,16 +7,14 @@ it, so here the list of fields, and each field, is looked at before it is read.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Mapping
+from typing import Any, Final
 
 import msgpack
 
 from enact_dist.errors import ProtocolError
 from enact_dist.wire.limits import REQUEST_VALUES_MAX
 from enact_dist.wire.message_parts import annotated, lengths_of, miscounted, too_long
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 LONG_HEADER_BYTES: Final = 16 << 10
 """Headers up to this length are read at once: they hold no more than so many values."""

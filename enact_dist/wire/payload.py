@@ -8,8 +8,9 @@ once.
 from __future__ import annotations
 
 import typing
+from collections.abc import Iterator, Sequence
 from dataclasses import fields, is_dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import msgpack
 import numpy as np
@@ -34,9 +35,6 @@ from enact_dist.wire.tree_writer import (
     reference,
     too_large,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
 
 JOINED_BYTES_MIN: Final = 1 << 20
 """From here on data are copied while other threads run."""

@@ -8,12 +8,10 @@ lists the actors, and a mark that turns the direction of writing shows one name 
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Iterable
+from typing import Any, Final
 
 from enact_dist.errors import ProtocolError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
 
 _UNSAFE: Final = "\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028\u2029\u202a-\u202e\u2066-\u2069"
 """Control characters, breaks of lines and paragraphs, and marks of the direction of writing."""

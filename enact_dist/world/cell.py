@@ -31,11 +31,11 @@ from enact_dist.core.protocol.messages import (
 )
 from enact_dist.errors import EnactError, MisuseError
 from enact_dist.link.client.dropped import when_dropped
-from enact_dist.terms import FormerNames, checked_name
-from enact_dist.world.context import WorldContext
+from enact_dist.terms import Aspect, Entity, FormerNames, checked_name
+from enact_dist.world.context import Version, WorldContext
 from enact_dist.world.forks import drop_world
 from enact_dist.world.invalidation import invalidate
-from enact_dist.world.lineage import CauseTree, EffectTree, tree_of
+from enact_dist.world.lineage import CauseTree, EffectTree, Made, tree_of
 from enact_dist.world.listings import (
     ActorInfo,
     AspectInfo,
@@ -60,9 +60,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from enact_dist.link.client.locks import CellClient
-    from enact_dist.terms import Aspect, Entity
-    from enact_dist.world.context import Version
-    from enact_dist.world.lineage import Made
 
 _open: weakref.WeakKeyDictionary[CellClient, Any] = weakref.WeakKeyDictionary()
 """The sessions of cells that were not closed, with the shard inside this process, if it has one.

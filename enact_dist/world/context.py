@@ -33,7 +33,7 @@ from enact_dist.access.watch import Watch
 from enact_dist.core.protocol.datum import Position, Slot
 from enact_dist.errors import ForgottenError, MisuseError
 from enact_dist.link.refusals import moment_name
-from enact_dist.terms import Aspect, Entities, Entity, FormerNames, View, Write
+from enact_dist.terms import Aspect, Entities, Entity, FormerNames, LockRequest, View, Write
 from enact_dist.wire.payload import decode_untyped
 from enact_dist.world.forks import fork_world
 from enact_dist.world.past import CellContext, PastContext
@@ -45,7 +45,6 @@ if TYPE_CHECKING:
     from enact_dist.compare.two_worlds import Viewable
     from enact_dist.compare.watch_diff import DiffWatch
     from enact_dist.core.protocol.messages import Cause, VersionEntry
-    from enact_dist.terms import LockRequest
 
 T = TypeVar("T")
 

@@ -18,30 +18,28 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 
-from enact_dist.access.arguments import check_pattern, checked_each
+from enact_dist.access.arguments import Moment, check_pattern, checked_each
 from enact_dist.access.lock import refuse_inside_lock
 from enact_dist.access.snapshot import (
+    SlotInfo,
+    Snapshot,
     slot_info,
     slot_states,
     take_readings,
     take_snapshot,
     untyped_datum,
 )
-from enact_dist.core.protocol.messages import Item
+from enact_dist.core.protocol.messages import Item, SlotState
 from enact_dist.errors import MisuseError
 from enact_dist.link.refusals import moment_name
-from enact_dist.terms import Access, Context, Entities, Entity, FormerNames
+from enact_dist.terms import Access, Aspect, Context, Entities, Entity, FormerNames, LockRequest
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from enact_dist.access.arguments import Moment
     from enact_dist.access.session import Session
-    from enact_dist.access.snapshot import SlotInfo, Snapshot
     from enact_dist.compare.diff import Diff
     from enact_dist.compare.two_worlds import Viewable
-    from enact_dist.core.protocol.messages import SlotState
-    from enact_dist.terms import Aspect, LockRequest
 
 
 class CellContext(FormerNames, Context):

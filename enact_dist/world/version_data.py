@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from enact_dist.access import asking
 from enact_dist.access.snapshot import HeldView
 from enact_dist.access.writes import Writing
-from enact_dist.core.protocol.messages import Item, SlotVersion
+from enact_dist.core.protocol.messages import Item, SlotVersion, VersionEntry
 from enact_dist.errors import ForgottenError, LeaseLostError
 from enact_dist.terms import Access
 from enact_dist.wire.limits import ITEMS_MAX
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from enact_dist.access.session import Session
     from enact_dist.core.client.lock import MultiLock
     from enact_dist.core.protocol.datum import Datum, Slot
-    from enact_dist.core.protocol.messages import VersionEntry
     from enact_dist.link.client.locks import CellClient
 
 

@@ -23,16 +23,12 @@ import os
 import sys
 import threading
 import time
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-from enact_dist.actor.running.doing import place_of_thread
+from enact_dist.actor.running.doing import Doing, place_of_thread
 from enact_dist.operate.supervise import NEVER_AGAIN, RestartPauses
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from enact_dist.actor.running.doing import Doing
 
 LOOK_S: Final = 0.1
 """How often a wait looks."""

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.access.asking import ask_all, explained
 from enact_dist.access.reads import slot_of
-from enact_dist.actor.actor import narrowed, stands_for_trigger
+from enact_dist.actor.actor import Declared, narrowed, stands_for_trigger
 from enact_dist.actor.triggers import tick_before
-from enact_dist.core.protocol.datum import Slot
-from enact_dist.core.protocol.messages import ListHistory, SlotVersion, Versions
+from enact_dist.core.protocol.datum import Datum, Slot
+from enact_dist.core.protocol.messages import ListHistory, SlotVersion, VersionEntry, Versions
 from enact_dist.errors import ForgottenError, MisuseError
 from enact_dist.patterns import pattern_matches
 from enact_dist.terms import Entity
@@ -22,10 +22,7 @@ from enact_dist.world.version_data import Wanted, found_of
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
-    from enact_dist.actor.actor import Declared
     from enact_dist.actor.binding import BoundActor
-    from enact_dist.core.protocol.datum import Datum
-    from enact_dist.core.protocol.messages import VersionEntry
     from enact_dist.world.cell import Cell
     from enact_dist.world.lineage import CauseTree
 

@@ -26,7 +26,7 @@ from enact_dist.actor.binding import BoundActor
 from enact_dist.actor.running.doing import Doing, own_lines, raised
 from enact_dist.actor.running.past_step import PastStep, members_of, some
 from enact_dist.compare.diff import Diff, diff_places
-from enact_dist.core.protocol.datum import Slot
+from enact_dist.core.protocol.datum import Datum, Slot
 from enact_dist.errors import EnactError, LinkError, MisuseError, UnknownWorldError
 from enact_dist.terms import Aspect, Entity
 from enact_dist.wire.limits import BODY_BYTES_MAX, ITEMS_MAX
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from enact_dist.actor.actor import Actor
-    from enact_dist.core.protocol.datum import Datum
     from enact_dist.world.cell import Cell
 
 WAIT_S: Final = 10.0

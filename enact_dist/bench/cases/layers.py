@@ -35,8 +35,8 @@ from enact_dist.bench.cases.payloads import (
 from enact_dist.bench.cases.updates import floor_of, slots, update
 from enact_dist.bench.floors import PAUSED, SIZES, mapped, reply
 from enact_dist.bench.place import EMBEDDED
-from enact_dist.bench.rows import Case
-from enact_dist.bench.run import ROUNDS
+from enact_dist.bench.rows import Case, Key
+from enact_dist.bench.run import ROUNDS, Run
 from enact_dist.bench.timing import COUNT_MAX, PAUSE_S, timed
 from enact_dist.core.shard.shard import Shard
 from enact_dist.errors import LinkError
@@ -47,8 +47,6 @@ from enact_dist.wire.frames import decode_frame, encode_frame
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from enact_dist.bench.rows import Key
-    from enact_dist.bench.run import Run
     from enact_dist.core.protocol.messages import Message
     from enact_dist.world.context import WorldContext
 

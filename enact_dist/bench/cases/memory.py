@@ -9,13 +9,12 @@ import time
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.access.lock import Lock
-from enact_dist.bench.place import fresh_place
+from enact_dist.bench.place import Place, fresh_place
 from enact_dist.bench.rows import Row, value_row
 from enact_dist.bench.usage import private_bytes, slope
 from enact_dist.terms import Aspect, Durability, Entity, Write
 
 if TYPE_CHECKING:
-    from enact_dist.bench.place import Place
     from enact_dist.bench.run import Run
 
 SLOTS_PER_S: Final = 7_000

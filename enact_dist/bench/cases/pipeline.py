@@ -24,14 +24,13 @@ from enact_dist.bench.floors import written
 from enact_dist.bench.place import PIPELINE_WORKER
 from enact_dist.bench.rows import Case, Row, at_most, value_row
 from enact_dist.bench.timing import sleep_until
-from enact_dist.bench.usage import Usage
+from enact_dist.bench.usage import Sampled, Usage
 from enact_dist.link.memory.shared_folder import shared_root
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from enact_dist.bench.run import Run
-    from enact_dist.bench.usage import Sampled
     from enact_dist.verify.daemons import LineProcess
 
 NAME: Final = "pipeline"

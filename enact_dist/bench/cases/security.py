@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.bench.cases.payloads import fetch, floats, store
 from enact_dist.bench.cases.updates import slots, update
-from enact_dist.bench.place import CARRIER_VARIABLE, WORLD, environment, fresh_place
+from enact_dist.bench.place import CARRIER_VARIABLE, WORLD, Place, environment, fresh_place
 from enact_dist.bench.rows import Case, at_most, times
 from enact_dist.bench.timing import timed
 from enact_dist.core.protocol.messages import Ping
@@ -24,7 +24,6 @@ from enact_dist.world.connecting import connect
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from enact_dist.bench.place import Place
     from enact_dist.bench.run import Run
     from enact_dist.world.context import WorldContext
 

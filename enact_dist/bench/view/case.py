@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Final
 
-from enact_dist.bench.place import fresh_place
+from enact_dist.bench.place import Place, fresh_place
 from enact_dist.bench.rows import Case, at_most, sample_of, value_row
 from enact_dist.bench.usage import private_bytes, threads_ns
 from enact_dist.bench.view.worker import CHROMIUM, SHOWS
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from enact_dist.bench.place import Place
     from enact_dist.bench.run import Run
     from enact_dist.verify.daemons import LineProcess
 

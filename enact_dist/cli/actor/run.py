@@ -18,7 +18,7 @@ from enact_dist.cli.arguments import pairs
 from enact_dist.cli.target import cell_config, cell_target, is_endpoint, open_cell, see_modules
 from enact_dist.cli.verbs import DONE, exit_status, told
 from enact_dist.config.table import path_of, suggestion
-from enact_dist.config.types import ActorProcess, processes_of
+from enact_dist.config.types import ActorConfig, ActorProcess, CellConfig, processes_of
 from enact_dist.errors import ConfigError, EnactError, MisuseError, UnknownWorldError
 from enact_dist.link.daemon.service_manager import ServiceManager
 from enact_dist.link.log import READY, JsonLines, TextLines, say
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from enact_dist.actor.actor import Actor
     from enact_dist.actor.report import ActorStatistics
     from enact_dist.actor.running.runner import ActorRun
-    from enact_dist.config.types import ActorConfig, CellConfig
     from enact_dist.world.cell import Cell
 
 _log = logging.getLogger("enact.actor")

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from enact_dist.errors import ConfigError
 from enact_dist.extras import needing
-
-if TYPE_CHECKING:
-    import argparse
 
 _MODULES: Final = ("cv2", "scipy", "numba", "mujoco", "ompl", "ruckig", "mcap")
 """Modules that the demo needs beside those of the core."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from enact_dist.cli.target import PROGRAM, cell_target, is_endpoint, open_cell
 from enact_dist.cli.text.output import print_table, shown_bytes
 from enact_dist.cli.verbs import DONE, FAILED, UNREACHABLE, Output
-from enact_dist.config.types import without_password
+from enact_dist.config.types import CellConfig, without_password
 from enact_dist.core.state.clock import state_of
 from enact_dist.errors import ConfigError, MisuseError, ShardUnreachableError
 from enact_dist.link.daemon.counters import described
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
     from pathlib import Path
 
-    from enact_dist.config.types import CellConfig
     from enact_dist.link.daemon.health import ShardHealth
     from enact_dist.link.postgres.address import StoreAddress
     from enact_dist.world.listings import ShardInfo

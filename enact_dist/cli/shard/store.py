@@ -9,7 +9,7 @@ from enact_dist.cli.shard.shard import refuse_password
 from enact_dist.cli.target import cell_config
 from enact_dist.cli.text.output import ProgressLine, shown_bytes
 from enact_dist.cli.verbs import DONE, FAILED, Output
-from enact_dist.config.types import without_password
+from enact_dist.config.types import CellConfig, without_password
 from enact_dist.errors import ConfigError
 from enact_dist.link.postgres.address import StoreAddress, require_driver
 
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     import argparse
     from collections.abc import Callable
 
-    from enact_dist.config.types import CellConfig
     from enact_dist.link.offline.store_copy import CopiedStore
 
 

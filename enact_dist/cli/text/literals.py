@@ -10,8 +10,9 @@ from __future__ import annotations
 import json
 import re
 import sys
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +20,6 @@ from numpy.typing import NDArray
 from enact_dist.access.session import unknown_aspect
 from enact_dist.config.table import path_of
 from enact_dist.errors import ConfigError, DatumTypeError, MisuseError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
 
 NOTHING: Final = object()
 """What `read` returns for the literal ``null``: the datum is to be deleted."""

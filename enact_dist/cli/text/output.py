@@ -6,13 +6,11 @@ import dataclasses
 import json
 import sys
 import time
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterable, Sequence
+from typing import Final
 
 from enact_dist.wire.texts import shown, shown_json
 from enact_dist.world.trees import on_terminal
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
 
 COLOURS = ("36", "33", "35", "32", "34", "31", "96", "93", "95", "92")
 """ANSI colours of log prefixes, in turn."""

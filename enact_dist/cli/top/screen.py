@@ -11,7 +11,7 @@ import time
 from typing import TYPE_CHECKING, ClassVar, Final
 
 from rich.text import Text
-from textual.app import App
+from textual.app import App, ComposeResult
 from textual.binding import Binding
 from textual.message import Message
 from textual.widgets import DataTable, Footer, Input, Static
@@ -22,8 +22,6 @@ from enact_dist.wire.texts import shown
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-
-    from textual.app import ComposeResult
 
     from enact_dist.operate.cell_rows import CellRates
 

@@ -8,10 +8,10 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
-from enact_dist.access.watch import Watch
+from enact_dist.access.watch import Change, Watch
 from enact_dist.cli.target import open_cell
 from enact_dist.cli.text.output import print_json_line, print_table, shown_bytes
-from enact_dist.cli.text.rates import Rates, Sample
+from enact_dist.cli.text.rates import Rates, Sample, Tally
 from enact_dist.cli.verbs import DONE
 from enact_dist.config.table import suggestion
 from enact_dist.core.protocol.datum import Slot
@@ -19,18 +19,15 @@ from enact_dist.errors import LinkError, ProtocolError, ShardUnreachableError
 from enact_dist.link.signals import StopSignals
 from enact_dist.wire.payload import decode_untyped
 from enact_dist.world.trees import shown_s
-from enact_dist.world.version_data import Wanted, explained, found_of
+from enact_dist.world.version_data import Retained, Wanted, explained, found_of
 
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Iterable, Iterator
 
     from enact_dist.access.session import Session
-    from enact_dist.access.watch import Change
-    from enact_dist.cli.text.rates import Tally
     from enact_dist.world.cell import Cell
     from enact_dist.world.context import WorldContext
-    from enact_dist.world.version_data import Retained
 
 WATCH_SLICE_S: Final = 0.2
 """How soon a watch notices a signal."""

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable
+from typing import Final
 
 RETRY_NS_MIN: Final = 20_000_000
 RETRY_NS_MAX: Final = 300_000_000

@@ -8,7 +8,7 @@ from __future__ import annotations
 from itertools import repeat
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.client.kept import Keeping
+from enact_dist.core.client.kept import Keeping, KeptGrant
 from enact_dist.core.client.lease_clock import shortened_ns
 from enact_dist.core.client.lock import MultiLock
 from enact_dist.core.client.plan import Phase, Plan, Reading
@@ -21,7 +21,6 @@ from enact_dist.terms import ACCESSES, Access
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from enact_dist.core.client.kept import KeptGrant
     from enact_dist.core.protocol.messages import Item, PlacementMap
 
 PLANNED_MAX: Final = 32

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from enact_dist.core.protocol.messages import TakeView
+from enact_dist.core.protocol.messages import Item, Request, TakeView, Viewed
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from enact_dist.core.client.plan import Plan
     from enact_dist.core.client.session import ClientSession
     from enact_dist.core.protocol.datum import LockId
-    from enact_dist.core.protocol.messages import Item, Request, Viewed
 
 ROUNDS_MAX: Final = 8
 """How often shards are asked before the views are given up."""

@@ -15,15 +15,22 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from enact_dist.core.client.plan import Phase
-from enact_dist.core.protocol.datum import Token
+from enact_dist.core.client.plan import Part, Phase
+from enact_dist.core.protocol.datum import LockId, Token
 from enact_dist.core.protocol.messages import (
     OUTCOME_EXPIRED,
     OUTCOME_PENDING,
+    Changed,
     Commit,
+    DatumRead,
+    OutcomeIs,
+    PlacementMap,
     Prepare,
+    Prepared,
+    Request,
     SlotVersion,
     Validate,
+    WriteItem,
 )
 from enact_dist.core.protocol.placement import shard_of
 from enact_dist.core.state.clock import is_kept
@@ -33,17 +40,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from enact_dist.core.client.kept import Keeping
-    from enact_dist.core.client.plan import Part
-    from enact_dist.core.protocol.datum import LockId
-    from enact_dist.core.protocol.messages import (
-        Changed,
-        DatumRead,
-        OutcomeIs,
-        PlacementMap,
-        Prepared,
-        Request,
-        WriteItem,
-    )
 
 
 @dataclass(slots=True)

@@ -17,14 +17,10 @@ must keep (each has a wrong edit in `tests/sim/test_takeover.py`):
 from __future__ import annotations
 
 import enum
-from typing import TYPE_CHECKING, Final, NamedTuple
+from collections.abc import Sequence
+from typing import Final, NamedTuple
 
-from enact_dist.core.protocol.records import Persist, Story
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from enact_dist.core.protocol.records import Effect
+from enact_dist.core.protocol.records import Effect, Persist, Story
 
 DRIFT_PPM: Final = 20_000
 """How much two clocks may differ: the holder counts less, a standby counts more."""

@@ -5,11 +5,9 @@ The core never looks into a datum: `encoding` and `body` are made and read by `e
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple, TypeVar, dataclass_transform
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
+from typing import NamedTuple, TypeVar, dataclass_transform
 
 T = TypeVar("T")
 

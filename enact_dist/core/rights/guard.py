@@ -28,7 +28,8 @@ is compared again behind its fence, since a client may send anything.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, Protocol
+from collections.abc import Callable, Collection, Iterable, Iterator
+from typing import Final, Protocol
 
 from enact_dist.core.protocol.datum import Slot
 from enact_dist.core.protocol.messages import (
@@ -42,6 +43,7 @@ from enact_dist.core.protocol.messages import (
     ForceAbort,
     Fork,
     Goodbye,
+    Item,
     KeepVersions,
     ListAudit,
     ListHistory,
@@ -54,17 +56,11 @@ from enact_dist.core.protocol.messages import (
     Release,
     Stage,
     TakeView,
+    WriteItem,
 )
-from enact_dist.core.protocol.records import Story
-from enact_dist.core.rights.rules import ALL, UNPROVEN, WRITE, path_of
+from enact_dist.core.protocol.records import Content, Story
+from enact_dist.core.rights.rules import ALL, UNPROVEN, WRITE, Rights, path_of
 from enact_dist.terms import ACCESSES
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator
-
-    from enact_dist.core.protocol.messages import Item, WriteItem
-    from enact_dist.core.protocol.records import Content
-    from enact_dist.core.rights.rules import Rights
 
 TOLD_EACH_NS: Final = 1_000_000_000
 """The log names a subject and a right at most once in this time."""

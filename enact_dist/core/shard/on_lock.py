@@ -6,13 +6,14 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.checks import unknown_world, wrong_access
-from enact_dist.core.protocol.datum import Column, Datum, LockId
+from enact_dist.core.protocol.datum import Column, Datum, LockId, Slot
 from enact_dist.core.protocol.messages import (
     Acquire,
     Answer,
     EpochChanged,
     Fetch,
     Gone,
+    Item,
     Refused,
     Release,
     Released,
@@ -23,17 +24,14 @@ from enact_dist.core.protocol.messages import (
 from enact_dist.core.protocol.records import Effect, Reply
 from enact_dist.core.shard import owners
 from enact_dist.core.state.sessions import LANES_MAX, Lane, SessionState
-from enact_dist.core.state.tenure import Shape, shape_of
+from enact_dist.core.state.tenure import Shape, Tenure, shape_of
 from enact_dist.terms import ACCESSES
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from enact_dist.core.protocol.datum import Slot
-    from enact_dist.core.protocol.messages import Item
     from enact_dist.core.shard.on_prepare import PrepareDesk
     from enact_dist.core.shard.state import ShardState
-    from enact_dist.core.state.tenure import Tenure
 
 ITEMS_MAX: Final = 4096
 """Requests in one lock or view."""

@@ -27,12 +27,13 @@ from enact_dist.core.protocol.messages import (
     AwaitStamp,
     EpochChanged,
     Forgotten,
+    Item,
     Reached,
     Refused,
     TakeView,
     Viewed,
 )
-from enact_dist.core.protocol.records import Reply
+from enact_dist.core.protocol.records import Effect, Reply
 from enact_dist.core.state.grants import WAIT_SLICE_NS_MAX
 from enact_dist.patterns import pattern_matches
 from enact_dist.terms import ACCESSES
@@ -40,8 +41,6 @@ from enact_dist.terms import ACCESSES
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
-    from enact_dist.core.protocol.messages import Item
-    from enact_dist.core.protocol.records import Effect
     from enact_dist.core.shard.on_lock import LockDesk
     from enact_dist.core.shard.on_prepare import PrepareDesk
     from enact_dist.core.shard.state import ShardState

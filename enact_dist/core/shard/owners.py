@@ -46,12 +46,11 @@ from enact_dist.core.protocol.messages import (
     Request,
     Resolve,
 )
-from enact_dist.core.protocol.records import Reply, Story
+from enact_dist.core.protocol.records import Effect, Event, Reply, Story
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from enact_dist.core.protocol.records import Effect, Event
     from enact_dist.core.state.sessions import SessionTable
 
 SESSIONS_MAX: Final = 256

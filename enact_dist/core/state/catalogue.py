@@ -7,19 +7,15 @@ it, shows of it what has room, and takes nothing new until some of it has gone.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Final, NamedTuple, TypeVar
 
 from enact_dist.core.protocol.datum_types import type_conflict, with_type_of
-from enact_dist.core.protocol.messages import Refused
+from enact_dist.core.protocol.messages import AspectEntry, Refused, WorldEntry, WriteItem
 from enact_dist.core.protocol.pages import bytes_in_frame
 from enact_dist.core.state.history import Policy
 from enact_dist.core.state.retention import covers, limits_of, with_larger
 from enact_dist.terms import Durability
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
-
-    from enact_dist.core.protocol.messages import AspectEntry, WorldEntry, WriteItem
 
 E = TypeVar("E")
 _STRICTNESS: Final = (Durability.VOLATILE, Durability.OS, Durability.DURABLE)

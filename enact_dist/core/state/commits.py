@@ -35,12 +35,13 @@ from enact_dist.core.protocol.checks import (
     wrong_commit,
     wrong_name,
 )
-from enact_dist.core.protocol.datum import Position, Slot
+from enact_dist.core.protocol.datum import LockId, Position, Slot, Token
 from enact_dist.core.protocol.messages import (
     OUTCOME_COMMITTED,
     OUTCOME_EXPIRED,
     OUTCOME_PENDING,
     OUTCOME_UNSEEN,
+    Cause,
     Changed,
     Commit,
     Committed,
@@ -49,6 +50,7 @@ from enact_dist.core.protocol.messages import (
     Notice,
     Outcome,
     OutcomeIs,
+    Prepare,
     Refused,
     SlotChange,
     SlotVersion,
@@ -65,26 +67,22 @@ from enact_dist.core.protocol.records import (
     Record,
     Reply,
     SlotRecord,
+    Then,
     cause_bytes,
 )
-from enact_dist.core.state.sessions import LANES_MAX, Lane
-from enact_dist.core.state.tenure import X
+from enact_dist.core.state.sessions import LANES_MAX, Lane, SessionTable
+from enact_dist.core.state.tenure import Tenure, X
 from enact_dist.terms import Durability, NullReason
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator
 
-    from enact_dist.core.protocol.datum import LockId, Token
-    from enact_dist.core.protocol.messages import Cause, Prepare
-    from enact_dist.core.protocol.records import Then
     from enact_dist.core.rights.guard import Guard
     from enact_dist.core.state.catalogue import Catalogue
     from enact_dist.core.state.clock import Stamps
     from enact_dist.core.state.decisions import Decisions
     from enact_dist.core.state.grants import Tenures
-    from enact_dist.core.state.sessions import SessionTable
     from enact_dist.core.state.slots import SlotMap
-    from enact_dist.core.state.tenure import Tenure
 
 _DELETED: Final = NullReason.DELETED
 

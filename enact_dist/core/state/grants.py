@@ -34,7 +34,7 @@ from enact_dist.core.protocol.messages import (
     Item,
     Waiting,
 )
-from enact_dist.core.protocol.records import Effect, Reply, Story
+from enact_dist.core.protocol.records import Effect, PreparedRecord, Reply, Story
 from enact_dist.core.state.clock import DueTimes, Latencies
 from enact_dist.core.state.lock_table import LockTable, Mode
 from enact_dist.core.state.slots import SlotMap
@@ -43,7 +43,6 @@ from enact_dist.core.state.tenure import KeptGrants, Shape, Tenure, shape_of, wa
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from enact_dist.core.protocol.records import PreparedRecord
     from enact_dist.core.state.sessions import SessionState, SessionTable
 
 WAIT_SLICE_NS_MAX: Final = 1_000_000_000

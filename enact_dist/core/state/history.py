@@ -14,18 +14,14 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import pairwise
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from enact_dist.core.protocol.datum import Slot
 from enact_dist.core.protocol.parts import NO_LIMIT, SlotVersion
-from enact_dist.core.protocol.records import HistoryForgotten, own_bytes
+from enact_dist.core.protocol.records import Content, HistoryForgotten, own_bytes
 from enact_dist.core.state.retention import DEFAULT, KeptVersion, Limits, PayloadNames, SlotHistory
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
-
-    from enact_dist.core.protocol.records import Content
 
 LOOSE_NS: Final = 2_000_000_000
 """How long any replaced state is kept, on the clock of the stamps."""

@@ -21,13 +21,11 @@ added and a grant replaces a waiting mode by the same held one; so a counter per
 from __future__ import annotations
 
 import enum
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from enact_dist.core.protocol.datum import Column, LockId, Slot
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
 
 Resource = Slot | Column
 

@@ -26,16 +26,14 @@ from itertools import islice, pairwise
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from enact_dist.core.protocol.parts import NO_LIMIT
-from enact_dist.retention import DEFAULT_RETENTION
+from enact_dist.core.protocol.parts import NO_LIMIT, AspectEntry
+from enact_dist.retention import DEFAULT_RETENTION, Retention
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
 
     from enact_dist.core.protocol.datum import Datum, Slot
-    from enact_dist.core.protocol.parts import AspectEntry
     from enact_dist.core.protocol.records import AspectForgotten, Content, WorldDropped
-    from enact_dist.retention import Retention
 
 _stamp_ns = attrgetter("stamp_ns")
 

@@ -8,31 +8,29 @@ comparable within one epoch of the shard.
 
 from __future__ import annotations
 
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from heapq import nlargest
 from itertools import islice
 from operator import itemgetter
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from enact_dist.core.protocol.datum import Column, Datum, Slot
-from enact_dist.core.protocol.messages import Forgotten, SlotState, SlotVersion
-from enact_dist.core.protocol.records import LOST, NOTHING, Content, content_of
-from enact_dist.core.state.history import History
+from enact_dist.core.protocol.messages import Forgotten, Item, SlotState, SlotVersion, WriteItem
+from enact_dist.core.protocol.records import (
+    LOST,
+    NOTHING,
+    AspectForgotten,
+    Content,
+    KeptRecord,
+    SlotRecord,
+    WorldDropped,
+    content_of,
+)
+from enact_dist.core.state.history import History, Policy
 from enact_dist.core.state.retention import AspectBases, Bases, PayloadNames
 from enact_dist.patterns import pattern_matches
 from enact_dist.terms import ACCESSES, NullReason
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-
-    from enact_dist.core.protocol.messages import Item, WriteItem
-    from enact_dist.core.protocol.records import (
-        AspectForgotten,
-        KeptRecord,
-        SlotRecord,
-        WorldDropped,
-    )
-    from enact_dist.core.state.history import Policy
 
 INLINE_BYTES_MAX: Final = 64 * 1024
 """Data up to this size travel with the grant; larger ones are fetched when they are read."""

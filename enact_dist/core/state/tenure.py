@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, Protocol
 
 from enact_dist.core.protocol.datum import Column, Datum, LockId, Slot, Token
-from enact_dist.core.protocol.messages import NOT_KEPT, PLACES
+from enact_dist.core.protocol.messages import NOT_KEPT, PLACES, Item
 from enact_dist.core.state.lock_table import Claim, Mode, Resource, join
 from enact_dist.patterns import pattern_matches
 from enact_dist.terms import ACCESSES, Access
@@ -30,7 +30,6 @@ from enact_dist.terms import ACCESSES, Access
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from enact_dist.core.protocol.messages import Item
     from enact_dist.core.protocol.records import PreparedRecord
 
 _IS, _IX, _S, X = Mode.IS, Mode.IX, Mode.S, Mode.X

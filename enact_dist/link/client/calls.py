@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from enact_dist.core.protocol.messages import (
     PAGED,
     START,
     Acquire,
+    Answer,
     Audited,
     Commit,
     EpochChanged,
@@ -17,15 +19,12 @@ from enact_dist.core.protocol.messages import (
     Kept,
     Locks,
     Prepare,
+    Request,
     Sessions,
     Surveyed,
     Versions,
+    WriteItem,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from enact_dist.core.protocol.messages import Answer, Request, WriteItem
 
 CALL_S: Final = 1.0
 """How long one call may stay unanswered before its outcome is unknown and it is repeated."""

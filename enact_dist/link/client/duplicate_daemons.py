@@ -14,8 +14,8 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.protocol.messages import ListPlaces, Ping, Places, Pong
-from enact_dist.core.protocol.records import Served
+from enact_dist.core.protocol.messages import ListPlaces, Ping, Places, Pong, ShardEntry
+from enact_dist.core.protocol.records import Compare, Served
 from enact_dist.errors import ConfigError, ShardUnreachableError
 from enact_dist.link.zenoh.config import to_reach
 from enact_dist.link.zenoh.discovery import FoundShard, ask_shards
@@ -24,8 +24,6 @@ from enact_dist.link.zenoh.endpoints import PROTOCOLS, somebody_listens, split_e
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from enact_dist.core.protocol.messages import ShardEntry
-    from enact_dist.core.protocol.records import Compare
     from enact_dist.link.zenoh.tls import KeyFiles
 
 _log = logging.getLogger("enact.link")

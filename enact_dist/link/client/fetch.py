@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from enact_dist.core.protocol.datum import Datum
-from enact_dist.core.protocol.messages import EpochChanged, Fetch, Gone, Slice
+from enact_dist.core.protocol.datum import Datum, LockId, Slot
+from enact_dist.core.protocol.messages import Answer, EpochChanged, Fetch, Gone, Slice, SlotState
 from enact_dist.errors import LeaseLostError, ProtocolError
 from enact_dist.link.client.transfer import Piece, Transfer, in_turn
 from enact_dist.link.memory.maps import RECYCLED_BYTES_MAX, body_of, plain_memory
@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from enact_dist.core.client.plan import Reading
-    from enact_dist.core.protocol.datum import LockId, Slot
-    from enact_dist.core.protocol.messages import Answer, SlotState
     from enact_dist.link.client.locks import CellClient
 
 CACHE_BYTES_MAX: Final = 256 << 20

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.protocol.messages import Welcome
+from enact_dist.core.protocol.messages import ShardEntry, Welcome
 from enact_dist.errors import LinkError
 from enact_dist.link.client.duplicate_daemons import Doubts
 from enact_dist.link.client.locks import CellClient
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from enact_dist.core.client.client import Client
-    from enact_dist.core.protocol.messages import ShardEntry
     from enact_dist.link.carrier import Carrier
     from enact_dist.link.zenoh.tls import KeyFiles
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from enact_dist.core.protocol.messages import PROVE, Release
+from enact_dist.core.protocol.messages import PROVE, DatumRead, Item, Release
 
 if TYPE_CHECKING:
     import threading
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
     from enact_dist.core.client.client import Client
     from enact_dist.core.client.lock import MultiLock
-    from enact_dist.core.protocol.messages import DatumRead, Item
     from enact_dist.link.memory.payload_client import SharedPayloads
 
 

@@ -7,12 +7,10 @@ A figure without a remedy counts work done, or is harmless.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, NamedTuple
+from collections.abc import Iterator, Mapping
+from typing import Final, NamedTuple
 
 from enact_dist.wire.limits import INLINE_BYTES_MAX
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
 
 BODIES: Final = (
     f"arrays, long lists, texts and bytes over {INLINE_BYTES_MAX} B; other data count as 0"

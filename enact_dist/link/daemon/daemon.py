@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.protocol.messages import ListLocks, Locks
+from enact_dist.core.protocol.messages import Answer, ListLocks, Locks
 from enact_dist.core.protocol.records import Called, SessionBarred, SessionSeen, ShardReturned
 from enact_dist.errors import ConfigError, LinkError
 from enact_dist.link.client.calls import Calls
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 
     import zenoh
 
-    from enact_dist.core.protocol.messages import Answer
     from enact_dist.link.daemon.metrics import MetricsServer
     from enact_dist.link.host import ShardHost
     from enact_dist.link.postgres.address import FreeShard

@@ -7,20 +7,15 @@ wire.
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import TYPE_CHECKING
 
 from enact_dist.core.protocol.messages import Ping, Pong
 from enact_dist.errors import ShardUnreachableError
 from enact_dist.link.zenoh.config import to_reach
 from enact_dist.link.zenoh.discovery import FoundShard, ask_shards, find_shards
-from enact_dist.link.zenoh.tls import why_refused
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from enact_dist.link.zenoh.tls import KeyFiles
+from enact_dist.link.zenoh.tls import KeyFiles, why_refused
 
 
 @dataclass(frozen=True, slots=True)

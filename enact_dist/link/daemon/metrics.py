@@ -18,7 +18,7 @@ import logging
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler
@@ -26,14 +26,11 @@ from itertools import accumulate
 from socketserver import TCPServer, ThreadingMixIn
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 
-from enact_dist.core.state.clock import BOUNDS_S
+from enact_dist.core.state.clock import BOUNDS_S, Latencies
 from enact_dist.errors import LinkError
 from enact_dist.link.daemon.counters import GAUGES_OF_A_SHARD, LATENCIES_OF_A_SHARD, OF_A_SHARD
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
-    from enact_dist.core.state.clock import Latencies
     from enact_dist.link.daemon.settings import DaemonSettings
     from enact_dist.link.host import ShardHost
 

@@ -9,15 +9,11 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable, Iterable
+from typing import Final
 
 from enact_dist.errors import ConfigError, EnactError
-from enact_dist.link.zenoh.tls import day_of, hosts_missing, own_certificate
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-
-    from enact_dist.link.zenoh.tls import Certificate, KeyFiles
+from enact_dist.link.zenoh.tls import Certificate, KeyFiles, day_of, hosts_missing, own_certificate
 
 LAST_PART: Final = 0.1
 """In the last tenth of its life a certificate is replaced as soon as there is a newer file."""

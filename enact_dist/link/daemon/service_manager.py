@@ -20,10 +20,8 @@ import logging
 import os
 import socket
 import time
-from typing import TYPE_CHECKING, Final
-
-if TYPE_CHECKING:
-    from collections.abc import MutableMapping
+from collections.abc import MutableMapping
+from typing import Final
 
 SEND_S: Final = 1.0
 """How long a message about a change may wait for a manager that is slow to read."""

@@ -9,17 +9,14 @@ from __future__ import annotations
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any, Final
 
-from enact_dist.core.protocol.records import Persist
+from enact_dist.core.protocol.records import Persist, Record, Recovered
 from enact_dist.errors import StoreError
-from enact_dist.link.store.store import open_store, read_store
+from enact_dist.link.store.store import Store, open_store, read_store
 from enact_dist.terms import Durability
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
     from pathlib import Path
-
-    from enact_dist.core.protocol.records import Record, Recovered
-    from enact_dist.link.store.store import Store
 
 
 class _Silent:

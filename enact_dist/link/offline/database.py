@@ -8,7 +8,7 @@ nothing to complete.  The rules of `link.offline.rebalance` about epochs and old
 from __future__ import annotations
 
 import time
-from contextlib import closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import psycopg
@@ -19,11 +19,11 @@ from enact_dist.core.offline.forgetting import world_drops
 from enact_dist.core.offline.moving import Shards
 from enact_dist.errors import StoreError
 from enact_dist.link.offline.cell import SILENT, refuse_obstacles, write
-from enact_dist.link.offline.forgetting import planned_purge
-from enact_dist.link.offline.rebalance import Rebalance, carry_out, wait_for_leases
+from enact_dist.link.offline.forgetting import Purged, PurgeProgress, planned_purge
+from enact_dist.link.offline.rebalance import Progress, Rebalance, carry_out, wait_for_leases
 from enact_dist.link.postgres.address import StoreAddress
 from enact_dist.link.postgres.bodies import BodiesToWrite
-from enact_dist.link.postgres.connection import CONFIRMED, connector_of
+from enact_dist.link.postgres.connection import CONFIRMED, DatabaseSession, connector_of
 from enact_dist.link.postgres.medium import database_errors, send_batch
 from enact_dist.link.postgres.opening import read_whole
 from enact_dist.link.postgres.restored import idle_rows, refuse_served, rows_of_cell
@@ -32,15 +32,11 @@ from enact_dist.link.store.store import Store
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-    from contextlib import AbstractContextManager
 
     from enact_dist.core.failover.lease import HolderRow
     from enact_dist.core.protocol.messages import PlacementMap
     from enact_dist.core.protocol.records import Recovered
     from enact_dist.link.folder.blobs import Blob
-    from enact_dist.link.offline.forgetting import Purged, PurgeProgress
-    from enact_dist.link.offline.rebalance import Progress
-    from enact_dist.link.postgres.connection import DatabaseSession
     from enact_dist.link.store.database import DatabaseRow
 
 _STOP: Final = "stop all daemons of the cell first; nothing was changed"

@@ -19,7 +19,7 @@ import time
 from itertools import groupby
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
-from enact_dist.core.offline.moving import Move, Shards
+from enact_dist.core.offline.moving import Move, MovePlan, Shards
 from enact_dist.link.folder.marks import mark, under_way, unmark
 from enact_dist.link.offline.cell import SILENT, opened, refuse_obstacles, write
 
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
     from pathlib import Path
 
-    from enact_dist.core.offline.moving import MovePlan
     from enact_dist.core.protocol.messages import PlacementMap
     from enact_dist.core.protocol.records import Recovered
     from enact_dist.link.store.store import Store

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import zlib
-from typing import TYPE_CHECKING, Final, NamedTuple
+from collections.abc import Iterable
+from typing import Final, NamedTuple
 
 from enact_dist.link.folder.blobs import Blob, DamagedBlobError, Mapped
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
 
 PART_BYTES: Final = 1 << 20
 """Bodies are stored in parts of this size, which bounds what one row takes of memory."""

@@ -17,7 +17,7 @@ import socket
 import threading
 import time
 import weakref
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from typing import TYPE_CHECKING, Any, Final
 
 import psycopg
@@ -29,7 +29,6 @@ from enact_dist.errors import StoreError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
-    from contextlib import AbstractContextManager
 
     from enact_dist.link.postgres.address import StoreAddress
 

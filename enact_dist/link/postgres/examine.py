@@ -8,13 +8,13 @@ from __future__ import annotations
 import time
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import psycopg
 
 from enact_dist.errors import StoreError
 from enact_dist.link.postgres.address import NamedHolder, StandbyFigures
-from enact_dist.link.postgres.connection import Connector, in_one_line, myself
+from enact_dist.link.postgres.connection import Connector, DatabaseSession, in_one_line, myself
 from enact_dist.link.postgres.line import RENEW_S
 from enact_dist.link.postgres.medium import remedy_of
 from enact_dist.link.postgres.tables import (
@@ -25,9 +25,6 @@ from enact_dist.link.postgres.tables import (
     read_standby,
     state_of_shard,
 )
-
-if TYPE_CHECKING:
-    from enact_dist.link.postgres.connection import DatabaseSession
 
 BEAT_S: Final = 2.5 * RENEW_S
 """Within that a holder that lives has renewed its lease."""

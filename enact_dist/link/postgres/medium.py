@@ -8,7 +8,7 @@ exactly once.
 
 from __future__ import annotations
 
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import TYPE_CHECKING, Any, Final
 
 import psycopg
@@ -16,19 +16,15 @@ from psycopg.types.numeric import Int8
 
 from enact_dist.core.failover.lease import BrokenBatch, after_break
 from enact_dist.errors import StoreError
-from enact_dist.link.postgres.bodies import PART_BYTES, BodiesToWrite
-from enact_dist.link.postgres.connection import CONFIRMED, RECEIVED, in_one_line
-from enact_dist.link.postgres.line import Line
+from enact_dist.link.postgres.bodies import PART_BYTES, BodiesToWrite, NewBody
+from enact_dist.link.postgres.connection import CONFIRMED, RECEIVED, DatabaseSession, in_one_line
+from enact_dist.link.postgres.line import HeldRow, Line, Renewer
 from enact_dist.link.postgres.tables import PUT_BODY, WRITE
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
-    from contextlib import AbstractContextManager
 
     from enact_dist.link.folder.blobs import Blob
-    from enact_dist.link.postgres.bodies import NewBody
-    from enact_dist.link.postgres.connection import DatabaseSession
-    from enact_dist.link.postgres.line import HeldRow, Renewer
     from enact_dist.link.store.database import DatabaseRow
 
 _PARTS_AT_ONCE: Final = (4 << 20) // PART_BYTES

@@ -6,18 +6,14 @@ may make it.  The daemon finds it at its next renewal.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from enact_dist.errors import StoreError
-from enact_dist.link.postgres.address import NamedHolder
+from enact_dist.link.postgres.address import NamedHolder, StoreAddress
 from enact_dist.link.postgres.connection import CONFIRMED, connector_of
-from enact_dist.link.postgres.examine import examine_database
+from enact_dist.link.postgres.examine import ShardRow, examine_database
 from enact_dist.link.postgres.medium import database_errors
 from enact_dist.link.postgres.tables import MOVE
-
-if TYPE_CHECKING:
-    from enact_dist.link.postgres.address import StoreAddress
-    from enact_dist.link.postgres.examine import ShardRow
 
 
 class AskedMove(NamedTuple):

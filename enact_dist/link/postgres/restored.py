@@ -8,22 +8,17 @@ has lived through the restore writes nothing more, and the next start need not w
 from __future__ import annotations
 
 import time
+from collections.abc import Collection
 from contextlib import closing
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from enact_dist.config.types import without_password
 from enact_dist.core.failover.lease import HolderRow, Standby
 from enact_dist.errors import StoreError
-from enact_dist.link.postgres.connection import CONFIRMED, Connector, myself
+from enact_dist.link.postgres.connection import CONFIRMED, Connector, DatabaseSession, myself
 from enact_dist.link.postgres.medium import database_errors
 from enact_dist.link.postgres.standby import LOOK_S
 from enact_dist.link.postgres.tables import CLOCK, MISSING, RAISE, SHARDS
-
-if TYPE_CHECKING:
-    from collections.abc import Collection
-
-    from enact_dist.link.postgres.connection import DatabaseSession
-
 
 _REMEDY: Final = (
     "stop all daemons of the cell first, since they remember what the restore took back; nothing"

@@ -16,9 +16,10 @@ import socket
 import threading
 import time
 import weakref
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable
+from typing import Final
 
-from enact_dist.core.protocol.messages import Answer, Notice
+from enact_dist.core.protocol.messages import Answer, Notice, Request
 from enact_dist.errors import EnactError, LinkError, ProtocolError
 from enact_dist.link.carrier import LOOK_S
 from enact_dist.link.memory.shared_folder import open_shared
@@ -34,11 +35,6 @@ from enact_dist.link.socket.frames import (
 )
 from enact_dist.link.socket.peers import check_peer
 from enact_dist.wire.frames import decode_answer, decode_frame, encode_parts
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from enact_dist.core.protocol.messages import Request
 
 SOCKET_NAME: Final = "socket"
 CONNECTIONS_MAX: Final = 100

@@ -19,7 +19,7 @@ from collections import deque
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final, Protocol
 
-from enact_dist.link.notices import Skipped
+from enact_dist.link.notices import Interest, Skipped
 from enact_dist.link.socket.frames import FrameKind, prefixed, skipped_frame
 from enact_dist.wire.frames import encode_frame
 
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.datum import Slot
     from enact_dist.core.protocol.messages import Notice
     from enact_dist.link.host import ShardHost
-    from enact_dist.link.notices import Interest
 
 NOTICES_MAX: Final = 65_536
 """Notices queued for a watcher that does not read."""

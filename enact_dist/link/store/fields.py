@@ -7,10 +7,10 @@ Reading is strict: anything other than what is written here is damage, not a def
 from __future__ import annotations
 
 import reprlib
+from collections.abc import Callable, Sequence
 from operator import attrgetter
 from types import UnionType
 from typing import (
-    TYPE_CHECKING,
     Any,
     Final,
     Generic,
@@ -25,9 +25,6 @@ from typing import (
 import msgpack
 
 from enact_dist.core.protocol.datum import LockId, Position, Slot
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
 
 T = TypeVar("T")
 _SPREAD: Final = (Slot, LockId, Position)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import msgpack
 
-from enact_dist.core.protocol.records import Recovered, SlotRecord
+from enact_dist.core.protocol.records import AuditRecord, Recovered, SlotRecord
 from enact_dist.link.folder.folder import refuse
 from enact_dist.link.store.fields import DamagedRowError
 from enact_dist.link.store.rows import (
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
 
     from enact_dist.core.protocol.datum import LockId, Slot
     from enact_dist.core.protocol.messages import Cause
-    from enact_dist.core.protocol.records import AuditRecord
     from enact_dist.link.folder.blobs import Blob
     from enact_dist.link.store.database import DatabaseRow
 

@@ -16,7 +16,7 @@ import os
 import shutil
 import sqlite3
 import stat
-from contextlib import closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.errors import StoreError
@@ -26,6 +26,7 @@ from enact_dist.link.folder.folder import (
     BLOB_FOLDER,
     DATABASE_FILE,
     LOG_FILE,
+    FolderFindings,
     check_log,
     check_reach,
     has_blobs,
@@ -33,21 +34,17 @@ from enact_dist.link.folder.folder import (
     refuse,
 )
 from enact_dist.link.folder.held_bodies import remove_killed_backup
-from enact_dist.link.folder.lock import check_format, sync_folder
+from enact_dist.link.folder.lock import FolderLock, check_format, sync_folder
 from enact_dist.link.folder.mark import MarkFile
 from enact_dist.link.folder.wal_check import commit_ends
-from enact_dist.link.store.database import Database, is_damage
+from enact_dist.link.store.database import Database, DatabaseRow, is_damage
 from enact_dist.link.store.recovery import put_together, read_blobs, read_contents
 from enact_dist.link.store.rows import EPOCH_KEY
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
-    from contextlib import AbstractContextManager
     from pathlib import Path
 
-    from enact_dist.link.folder.folder import FolderFindings
-    from enact_dist.link.folder.lock import FolderLock
-    from enact_dist.link.store.database import DatabaseRow
     from enact_dist.link.store.gathering import Contents
 
 LOG_BYTES: Final = 8 << 20

@@ -19,9 +19,9 @@ from contextlib import closing
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from enact_dist.link.folder.blobs import DamagedBlobError, Mapped
+from enact_dist.link.folder.blobs import Blob, DamagedBlobError, Mapped
 from enact_dist.link.folder.folder import refuse
-from enact_dist.link.store.gathering import UNREADABLE, check_row, gather
+from enact_dist.link.store.gathering import UNREADABLE, CheckedRow, Contents, check_row, gather
 from enact_dist.link.store.rows import RowKind, prepared_writes, read_prepared, read_write_key
 from enact_dist.terms import NullReason
 
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
     from enact_dist.core.protocol.datum import LockId, Slot
     from enact_dist.core.protocol.records import SlotRecord
-    from enact_dist.link.folder.blobs import Blob
-    from enact_dist.link.store.gathering import CheckedRow, Contents
     from enact_dist.link.store.media import BodySource, RowSource
 
 _log = logging.getLogger("enact.store")

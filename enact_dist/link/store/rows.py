@@ -20,8 +20,9 @@ from __future__ import annotations
 
 import enum
 import zlib
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from enact_dist.core.protocol.datum import Datum, LockId, Slot
 from enact_dist.core.protocol.messages import AspectEntry, Cause, WriteItem
@@ -41,9 +42,6 @@ from enact_dist.core.protocol.records import (
 )
 from enact_dist.link.folder.blobs import Blob
 from enact_dist.link.store.fields import DamagedRowError, RowLayout, pack, unpack
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
 
 INLINE_BYTES_MAX: Final = 64 * 1024
 """Bodies up to this size live in their row, larger ones in a file of their own."""

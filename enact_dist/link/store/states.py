@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.datum import LockId, Slot
     from enact_dist.core.protocol.records import SlotRecord
     from enact_dist.link.folder.blobs import Blob
-    from enact_dist.link.store.rows import Key
 
 OUTCOMES_KEPT_NS: Final = 24 * 3600 * 1_000_000_000
 """How long the outcomes of an ended session can be asked for."""

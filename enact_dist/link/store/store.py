@@ -27,7 +27,7 @@ from __future__ import annotations
 from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.protocol.records import Recovered
+from enact_dist.core.protocol.records import Persist, Recovered
 from enact_dist.errors import StoreError
 from enact_dist.link.folder.lock import FolderLock
 from enact_dist.link.folder.marks import refuse_moving
@@ -48,7 +48,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
-    from enact_dist.core.protocol.records import Persist
     from enact_dist.link.folder.blobs import Blob
     from enact_dist.link.store.gathering import Contents
     from enact_dist.link.store.media import Medium

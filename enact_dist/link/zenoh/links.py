@@ -23,17 +23,14 @@ import socket
 import struct
 import threading
 import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final, TypeAlias
 
 import zenoh
 
 from enact_dist.link.zenoh.endpoints import STREAMS, split_endpoint
 from enact_dist.link.zenoh.events import Events
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
-    from typing import TypeAlias
 
 _DESCRIPTORS: Final = Path("/proc/self/fd")
 _TABLE: Final = Path("/proc/self/net/tcp")

@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.errors import LinkError
 from enact_dist.verify.chaos import daemon
-from enact_dist.verify.chaos.journal import SUFFIX
+from enact_dist.verify.chaos.journal import SUFFIX, Journal
 from enact_dist.verify.chaos.workload import WORLDS
 from enact_dist.verify.daemons import LineProcess, Processes, write_cell
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from enact_dist.verify.chaos.journal import Journal
     from enact_dist.verify.chaos.network.hosts import Hosts
 
 WATCHER: Final = "watcher"

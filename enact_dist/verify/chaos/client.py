@@ -8,18 +8,13 @@ from __future__ import annotations
 
 import sys
 import threading
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from enact_dist import connect
+from enact_dist import Cell, connect
 from enact_dist.errors import LinkError
 from enact_dist.verify.chaos.journal import Journal
 from enact_dist.verify.chaos.workload import LockWorkload
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from enact_dist import Cell
 
 
 class ClientProcess:

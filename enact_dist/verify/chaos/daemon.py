@@ -7,14 +7,12 @@ machine is set, and the product has no option for it.
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING, Final
+from collections.abc import Sequence
+from typing import Final
 
 from enact_dist.cli import main
 from enact_dist.link import host
 from enact_dist.link.clock import SystemClock
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 MODULE: Final = "enact_dist.verify.chaos.daemon"
 

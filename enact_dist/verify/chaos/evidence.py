@@ -20,13 +20,12 @@ from enact_dist.errors import ConfigError
 from enact_dist.verify.chaos import watcher
 from enact_dist.verify.chaos.journal import SUFFIX, read_lines
 from enact_dist.verify.chaos.replicated.answers import SUFFIX as ANSWERS
-from enact_dist.verify.chaos.replicated.answers import read_answers
+from enact_dist.verify.chaos.replicated.answers import ServedEpoch, read_answers
 from enact_dist.verify.checker import LockOutcome
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from enact_dist.verify.chaos.replicated.answers import ServedEpoch
 
 SETTINGS: Final = "settings.json"
 FAULTS: Final = "faults.log"

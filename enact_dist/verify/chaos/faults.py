@@ -29,13 +29,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Final
 
 from enact_dist.errors import LinkError
-from enact_dist.verify.chaos.cell import END_S
+from enact_dist.verify.chaos.cell import END_S, StartedClient, TestedCell
 from enact_dist.verify.chaos.network.switch import Cable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from enact_dist.verify.chaos.cell import StartedClient, TestedCell
     from enact_dist.verify.chaos.journal import Journal
     from enact_dist.verify.chaos.network.hosts import Hosts
 

@@ -20,16 +20,13 @@ import threading
 import time
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-from enact_dist import connect
+from enact_dist import Cell, connect
 from enact_dist.core.protocol.messages import ListLocks, ListSessions, Locks, Sessions
 from enact_dist.verify.chaos.journal import SUFFIX, Journal
 from enact_dist.verify.chaos.workload import LockWorkload
 from enact_dist.verify.checker import LockOutcome
-
-if TYPE_CHECKING:
-    from enact_dist import Cell
 
 LOG: Final = "watcher.log"
 PERIOD_S: Final = 0.1

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 from enact_dist import (
     Aspect,
+    Cell,
     Durability,
     Entities,
     Entity,
@@ -35,13 +36,11 @@ from enact_dist.errors import (
     LockTimeoutError,
     ShardUnreachableError,
 )
-from enact_dist.verify.chaos.journal import UNSEEN
+from enact_dist.verify.chaos.journal import UNSEEN, Journal
 from enact_dist.verify.checker import LockOutcome
 
 if TYPE_CHECKING:
-    from enact_dist import Cell
     from enact_dist.terms import LockRequest, LockRequestOne
-    from enact_dist.verify.chaos.journal import Journal
 
 WORLDS: Final = ("online", "training")
 ASPECTS: Final = {

@@ -8,12 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.datum import LockId
-from enact_dist.core.protocol.messages import (
-    Acquire,
-    AwaitStamp,
-    Item,
-    TakeView,
-)
+from enact_dist.core.protocol.messages import Acquire, AwaitStamp, Item, Request, TakeView, Welcome
 from enact_dist.terms import Access
 from enact_dist.verify.floods.raw import WINDOW, RawSocket, RawZenoh, fresh_session, hello
 from enact_dist.verify.floods.victim import HELD, KEPT, WORLD
@@ -22,7 +17,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from enact_dist.config.types import CellConfig
-    from enact_dist.core.protocol.messages import Request, Welcome
 
 FIRST: Final = "left"
 """The shard on which everything of the honest client lies."""

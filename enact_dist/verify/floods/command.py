@@ -8,12 +8,10 @@ from typing import TYPE_CHECKING
 from enact_dist.cli.text.output import print_json, print_table
 from enact_dist.cli.verbs import DONE, FAILED, USAGE
 from enact_dist.verify.floods.attacks import ATTACKS
-from enact_dist.verify.floods.run import P99_MS_MAX, measure
+from enact_dist.verify.floods.run import P99_MS_MAX, Figures, measure
 
 if TYPE_CHECKING:
     import argparse
-
-    from enact_dist.verify.floods.run import Figures
 
 
 def run(arguments: argparse.Namespace) -> int:

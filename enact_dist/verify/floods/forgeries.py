@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import time
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from enact_dist.core.protocol.datum import Datum, LockId, Position, Slot, Token
 from enact_dist.core.protocol.messages import (
@@ -23,21 +23,18 @@ from enact_dist.core.protocol.messages import (
     Locks,
     Prepare,
     Release,
+    Request,
     Resolve,
     Sessions,
     WriteItem,
 )
 from enact_dist.terms import Access
-from enact_dist.verify.floods.attacker import FIRST, SECOND, line_of
+from enact_dist.verify.floods.attacker import FIRST, SECOND, Attacker, line_of
 from enact_dist.verify.floods.raw import ACTOR, RawSocket, hello
 from enact_dist.verify.floods.victim import ACTOR as VICTIM
 from enact_dist.verify.floods.victim import COUNT, HELD, KEPT, WORLD
 from enact_dist.wire.keys import identity_of, token_key
 from enact_dist.wire.limits import INTEGER_MAX
-
-if TYPE_CHECKING:
-    from enact_dist.core.protocol.messages import Request
-    from enact_dist.verify.floods.attacker import Attacker
 
 
 def _in_the_victims_name(attacker: Attacker) -> list[Request]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import socket
 import time
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import msgpack
 
@@ -37,14 +37,11 @@ from enact_dist.errors import LinkError
 from enact_dist.link.socket.frames import MAGIC, STREAM_VERSION, FrameKind
 from enact_dist.link.zenoh.endpoints import split_endpoint
 from enact_dist.terms import Access
-from enact_dist.verify.floods.attacker import FIRST, line_of
+from enact_dist.verify.floods.attacker import FIRST, Attacker, line_of
 from enact_dist.verify.floods.raw import RawSocket, fresh_session, hello
 from enact_dist.verify.floods.victim import COUNT, HELD, KEPT, WORLD
 from enact_dist.wire.frames import CODES
 from enact_dist.wire.limits import FRAME_VERSION, INTEGER_MAX
-
-if TYPE_CHECKING:
-    from enact_dist.verify.floods.attacker import Attacker
 
 LONG_NAME: Final = "a" * 150
 WAIT_NS: Final = 25_000_000_000

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Final
 
 import zenoh
 
-from enact_dist.core.protocol.messages import Hello, Refused, Welcome
+from enact_dist.core.protocol.messages import Answer, Hello, Refused, Request, Welcome
 from enact_dist.errors import LinkError, ProtocolError
 from enact_dist.link.memory.shared_folder import open_shared
 from enact_dist.link.socket.frames import FrameKind, Stream, greeting_of, send_frame, wait_at_most
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from enact_dist.config.types import CellConfig
-    from enact_dist.core.protocol.messages import Answer, Request
     from enact_dist.link.zenoh.tls import KeyFiles
 
 ACTOR: Final = "attacker"

@@ -12,13 +12,12 @@ from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 from enact_dist.core.failover.lease import HolderRow
-from enact_dist.verify.simulation.hosts.world import MS
+from enact_dist.verify.simulation.hosts.world import MS, Host, SimulatedWorld
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from enact_dist.core.protocol.records import Persist
-    from enact_dist.verify.simulation.hosts.world import Host, SimulatedWorld
 
 ARRIVES = 0.5
 """Share of the statements that arrive although their connection broke on the way."""

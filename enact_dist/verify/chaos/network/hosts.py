@@ -18,17 +18,15 @@ import os
 import shutil
 import subprocess
 import uuid
+from collections.abc import Sequence
 from dataclasses import astuple
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import Final, Protocol
 
 from enact_dist.errors import LinkError
 from enact_dist.verify.chaos.network import switch
 from enact_dist.verify.chaos.network.switch import Cable, Counts
 from enact_dist.verify.daemons import KeptPorts, LineProcess
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 CLOCK_AHEAD_S: Final = 100_000
 """By how much each host's monotonic clock is ahead of the one before."""

@@ -28,14 +28,12 @@ import select
 import socket
 import sys
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, astuple, dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from enact_dist.errors import MisuseError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
 
 MODULE: Final = "enact_dist.verify.chaos.network.switch"
 QUEUE_S: Final = 0.25

@@ -14,14 +14,13 @@ from enact_dist.verify.chaos.cell import END_S, TestedCell
 from enact_dist.verify.chaos.replicated import daemon
 from enact_dist.verify.chaos.replicated.answers import SUFFIX
 from enact_dist.verify.chaos.workload import WORLDS
-from enact_dist.verify.daemons import LOG_BYTES, last_said, write_cell
+from enact_dist.verify.daemons import LOG_BYTES, LineProcess, last_said, write_cell
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from enact_dist.verify.chaos.journal import Journal
     from enact_dist.verify.chaos.network.hosts import Hosts
-    from enact_dist.verify.daemons import LineProcess
 
 AGAIN_S: Final = 0.3
 """When a daemon that ended is started again, as by a service manager."""

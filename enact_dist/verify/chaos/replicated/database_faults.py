@@ -19,7 +19,7 @@ Each one ends with a primary and a standby that confirms each commit.
 from __future__ import annotations
 
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
@@ -27,7 +27,6 @@ from enact_dist.errors import LinkError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from concurrent.futures import Future
     from random import Random
 
     from enact_dist.verify.chaos.replicated.cuts import SharedCuts

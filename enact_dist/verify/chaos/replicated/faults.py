@@ -35,8 +35,8 @@ from enact_dist.verify.chaos.faults import (
     FaultInjector,
 )
 from enact_dist.verify.chaos.replicated import database_faults
-from enact_dist.verify.chaos.replicated.cell import AGAIN_S, ReplicatedCell
-from enact_dist.verify.chaos.replicated.cuts import ways_between
+from enact_dist.verify.chaos.replicated.cell import AGAIN_S, DaemonPlace, ReplicatedCell
+from enact_dist.verify.chaos.replicated.cuts import SharedCuts, ways_between
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -44,8 +44,6 @@ if TYPE_CHECKING:
 
     from enact_dist.verify.chaos.journal import Journal
     from enact_dist.verify.chaos.network.hosts import Hosts
-    from enact_dist.verify.chaos.replicated.cell import DaemonPlace
-    from enact_dist.verify.chaos.replicated.cuts import SharedCuts
     from enact_dist.verify.chaos.replicated.database_faults import DatabaseFaults
 
 KILL_SERVING, KILL_STANDBY = "kill serving daemon", "kill standby daemon"

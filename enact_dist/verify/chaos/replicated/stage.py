@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from enact_dist.errors import LinkError, StoreError
 from enact_dist.link.postgres.address import StoreAddress, require_driver
 from enact_dist.verify.chaos.faults import StagedRun
-from enact_dist.verify.chaos.network.hosts import Loopback, Namespaces
+from enact_dist.verify.chaos.network.hosts import Hosts, Loopback, Namespaces
 from enact_dist.verify.chaos.replicated.cell import ReplicatedCell
 from enact_dist.verify.chaos.replicated.cuts import SharedCuts
 from enact_dist.verify.chaos.replicated.database_faults import DatabaseFaults
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from enact_dist.verify.chaos.journal import Journal
-    from enact_dist.verify.chaos.network.hosts import Hosts
 
 NODES: Final = "nodes"
 """In place of an address: two servers of the run's own."""
