@@ -18,10 +18,12 @@ The real core, locks and commits included, runs behind it; nothing is simulated 
 from __future__ import annotations
 
 import contextlib
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable, Iterator, Mapping
+from typing import Final
 from weakref import WeakKeyDictionary
 
 from enact_dist.access.session import session_of
+from enact_dist.access.sets import IncompleteSet, PendingSets
 from enact_dist.access.together import captured_versions
 from enact_dist.actor.actor import Actor, name_of
 from enact_dist.actor.binding import BoundActor
@@ -29,15 +31,9 @@ from enact_dist.actor.once import Once
 from enact_dist.actor.running.doing import Doing
 from enact_dist.actor.triggers import PendingTriggers, tick_before
 from enact_dist.link.clock import monotonic_ns, wall_ns
+from enact_dist.terms import Entity
+from enact_dist.world.cell import Cell
 from enact_dist.world.connecting import local
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
-
-    from enact_dist.access.sets import IncompleteSet, PendingSets
-    from enact_dist.terms import Entity
-    from enact_dist.world.cell import Cell
-
 
 STEP_NS: Final = 100_000_000
 """Time passes in steps of 0.1 s: a shard takes a longer one for its own standing still, for which

@@ -23,15 +23,12 @@ PURE: time arrives as an argument.  Rules that a change must keep:
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from enact_dist.access.trigger import WHOLE, Trigger
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from enact_dist.terms import Entity
+from enact_dist.terms import Entity
 
 TOLD_MAX: Final = 16
 """Incomplete sets that are kept by name."""

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Hashable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from enact_dist.errors import MisuseError
-
-if TYPE_CHECKING:
-    from collections.abc import Hashable
-
-    from enact_dist.terms import Entity, View
+from enact_dist.terms import Entity, View
 
 LOOK_S: Final = 0.1
 """How often a wait looks whether the actor is to stop."""

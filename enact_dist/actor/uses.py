@@ -6,17 +6,13 @@ requests, and to write what it may write.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from enact_dist.actor.actor import Actor, Declared, narrowed, same_data, stands_for_trigger
 from enact_dist.actor.running.commands import ACTOR, COMMANDS
 from enact_dist.config.rights import AllowTable
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
-
-    from enact_dist.terms import Entity
+from enact_dist.terms import Entity
 
 
 @dataclass(frozen=True, slots=True)

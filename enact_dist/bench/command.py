@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import os
 import platform
@@ -11,7 +12,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from enact_dist.bench.cases.decisions import core_cases
 from enact_dist.bench.cases.faults import run_recovery, run_stopped
@@ -36,10 +37,6 @@ from enact_dist.cli.text.output import print_json, print_table
 from enact_dist.cli.verbs import DONE, FAILED
 from enact_dist.errors import EnactError, MisuseError
 from enact_dist.link.memory.shared_folder import MEMORY
-
-if TYPE_CHECKING:
-    import argparse
-
 
 SECONDS_S: Final = 3.0
 """Measuring time of each line unless given."""

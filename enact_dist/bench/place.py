@@ -7,9 +7,10 @@ import json
 import os
 import signal
 import tempfile
+from collections.abc import Callable, Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from enact_dist.bench.visit import Visit, anywhere
 from enact_dist.config.read import load_config
@@ -18,13 +19,9 @@ from enact_dist.errors import MisuseError
 from enact_dist.link.memory.shared_folder import MEMORY, SHARED_FOLDER_VARIABLE
 from enact_dist.operate.supervise import SUPERVISOR_VARIABLE
 from enact_dist.verify.daemons import COMMAND, KeptPorts, LineProcess, write_cell
+from enact_dist.world.cell import Cell
 from enact_dist.world.connecting import connect, local
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
-    from enact_dist.world.cell import Cell
-    from enact_dist.world.context import WorldContext
+from enact_dist.world.context import WorldContext
 
 WORLD: Final = "bench"
 """The world context that all benches write into; made if it does not exist."""

@@ -14,15 +14,12 @@ from __future__ import annotations
 import gc
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final, NamedTuple
+from pathlib import Path
+from typing import Final, NamedTuple
 
 from enact_dist.bench.floors import Floors
 from enact_dist.bench.place import EMBEDDED, Place
 from enact_dist.bench.rows import FLOOR, Case, Key, Row, Timings, row_of, sample_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
 
 ROUNDS: Final = 3
 _PLAIN: Final = tuple(

@@ -16,8 +16,9 @@ from __future__ import annotations
 import json
 import sys
 import time
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -30,11 +31,7 @@ from enact_dist.bench.timing import sleep_until
 from enact_dist.link.client.fetch import DatumCache
 from enact_dist.terms import Entity, View, Write
 from enact_dist.world.connecting import connect
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from enact_dist.world.context import WorldContext
+from enact_dist.world.context import WorldContext
 
 
 def _store(world: WorldContext, _options: dict[str, Any]) -> None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Protocol
+from typing import Any, ClassVar, Final, Protocol
 
 import numpy as np
 
@@ -11,16 +12,12 @@ from enact_dist.access.asking import explained
 from enact_dist.access.reads import is_null
 from enact_dist.access.session import Session, unknown_aspect
 from enact_dist.access.snapshot import HeldView
+from enact_dist.core.client.plan import Reading
+from enact_dist.core.protocol.datum import Datum, Slot
 from enact_dist.core.protocol.messages import CAUSE_FORK, DatumRead, Item, SlotVersion
 from enact_dist.errors import MisuseError
 from enact_dist.terms import Access, Aspect
 from enact_dist.wire.limits import ITEMS_MAX
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-
-    from enact_dist.core.client.plan import Reading
-    from enact_dist.core.protocol.datum import Datum, Slot
 
 GENERATIONS_MAX: Final = 64
 """How many forks of forks are followed back to the context where a version was written."""

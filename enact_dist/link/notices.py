@@ -14,16 +14,13 @@ import select
 import threading
 import time
 from collections import deque
-from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
+from collections.abc import Callable, Iterable
+from typing import Final, NamedTuple, Protocol
 
+from enact_dist.core.protocol.datum import Slot
 from enact_dist.core.protocol.messages import Notice, Survey
 from enact_dist.errors import EnactError
 from enact_dist.patterns import Patterns
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-
-    from enact_dist.core.protocol.datum import Slot
 
 NOTICES_MAX: Final = 65_536
 """Notices queued for a slow watcher: 11 minutes at 100 per second."""

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import itertools
 import threading
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Final, TypeVar
 
 from enact_dist.config.table import suggestion
 from enact_dist.core.protocol.datum import LockId, Slot
 from enact_dist.core.protocol.messages import Cause, DatumRead, SlotState, VersionEntry
 from enact_dist.errors import MisuseError, UnknownWorldError
+from enact_dist.recording.exact import Recorded
 from enact_dist.recording.reading import Recording
 from enact_dist.world.lineage import (
     UNRECORDED,
@@ -24,12 +27,6 @@ from enact_dist.world.lineage import (
     in_order_made,
     in_order_read,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
-
-    from enact_dist.recording.exact import Recorded
 
 T = TypeVar("T")
 NO_LOCK: Final = LockId("", 0, 0)

@@ -15,15 +15,13 @@ import subprocess
 import sys
 import threading
 import time
-from typing import TYPE_CHECKING, Final
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
 
 from enact_dist.config.environment import without_overrides
 from enact_dist.errors import LinkError
 from enact_dist.link.log import in_words
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
 
 LINE_S: Final = 90.0
 """How long a line may stay out before the process counts as hung; many start at once."""

@@ -16,20 +16,17 @@ its predecessor ended.
 
 from __future__ import annotations
 
+import argparse
 import sys
 import tempfile
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from enact_dist.cli.text.output import print_json, print_table
 from enact_dist.cli.verbs import DONE, FAILED
 from enact_dist.verify.daemons import CellProcesses, LineProcess
-
-if TYPE_CHECKING:
-    import argparse
-    from collections.abc import Callable, Sequence
-
 
 TTL_S: Final = 2.0
 ROUNDS: Final = 5

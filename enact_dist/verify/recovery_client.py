@@ -15,18 +15,15 @@ import os
 import signal
 import sys
 import time
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Callable, Sequence
+from typing import Any, Final
 
 from enact_dist.access.lock import Lock
 from enact_dist.core.protocol.messages import Answer, Commit, Request
 from enact_dist.errors import LeaseLostError, ShardUnreachableError
 from enact_dist.terms import Aspect, Entity, Write
+from enact_dist.world.cell import Cell
 from enact_dist.world.connecting import connect
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from enact_dist.world.cell import Cell
 
 NUMBER: Final = Aspect("number", int)
 ENTITIES: Final = (Entity("left"), Entity("right"))

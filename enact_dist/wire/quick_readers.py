@@ -26,10 +26,11 @@ judge begins where the quick reader began.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final, get_args, get_origin
+from typing import Any, Final, get_args, get_origin
 
 from enact_dist.core.protocol.datum import Datum
 from enact_dist.errors import ProtocolError
+from enact_dist.wire.bodies import BodyReader
 from enact_dist.wire.limits import INTEGER_MAX
 from enact_dist.wire.message_parts import (
     SCALARS,
@@ -41,9 +42,6 @@ from enact_dist.wire.message_parts import (
     without_none,
 )
 from enact_dist.wire.texts import refuse_unsafe
-
-if TYPE_CHECKING:
-    from enact_dist.wire.bodies import BodyReader
 
 _JUDGE: Final = "        return judge(raw, bodies)"
 

@@ -8,20 +8,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable
+from typing import Any
 
 from enact_dist.access.arguments import checked_as
 from enact_dist.access.asking import ask_all, expected
+from enact_dist.access.session import Session
 from enact_dist.core.protocol.messages import KeepVersions, Kept, ListHistory, SlotVersion, Versions
 from enact_dist.errors import ForgottenError, MisuseError
 from enact_dist.terms import Aspect
 from enact_dist.world.context import Version, WorldContext
 from enact_dist.world.lineage import Made
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from enact_dist.access.session import Session
 
 
 def pinned_versions(session: Session) -> dict[str, tuple[Version[Any], ...]]:

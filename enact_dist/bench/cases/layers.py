@@ -16,9 +16,10 @@ import contextlib
 import itertools
 import threading
 import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from enact_dist.access import reads as reading
 from enact_dist.bench.cases import payloads
@@ -38,17 +39,13 @@ from enact_dist.bench.place import EMBEDDED
 from enact_dist.bench.rows import Case, Key
 from enact_dist.bench.run import ROUNDS, Run
 from enact_dist.bench.timing import COUNT_MAX, PAUSE_S, timed
+from enact_dist.core.protocol.messages import Message
 from enact_dist.core.shard.shard import Shard
 from enact_dist.errors import LinkError
 from enact_dist.link.client.locks import CellClient
 from enact_dist.link.daemon.embedded import EmbeddedCarrier
 from enact_dist.wire.frames import decode_frame, encode_frame
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
-    from enact_dist.core.protocol.messages import Message
-    from enact_dist.world.context import WorldContext
+from enact_dist.world.context import WorldContext
 
 NAME: Final = "layers"
 LOCK: Final = "lock and its data"

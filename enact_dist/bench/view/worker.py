@@ -16,9 +16,10 @@ import json
 import sys
 import threading
 import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,11 +29,7 @@ from enact_dist.bench.place import WORLD
 from enact_dist.bench.timing import sleep_until
 from enact_dist.terms import Aspect, Durability, Entity, View, Write
 from enact_dist.world.connecting import connect
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
-    from enact_dist.world.context import WorldContext
+from enact_dist.world.context import WorldContext
 
 CAMERAS: Final = 8
 ROBOTS: Final = 2

@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from enact_dist.core.protocol.datum import Slot
+from enact_dist.core.protocol.datum import Slot
 
 WINDOW_S: Final = 10.0
 """The span of time whose changes make the present figures."""

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import threading
 import time
-from typing import TYPE_CHECKING, ClassVar, Final
+from collections.abc import Callable, Iterator
+from typing import ClassVar, Final
 
 from rich.text import Text
 from textual.app import App, ComposeResult
@@ -18,12 +19,8 @@ from textual.widgets import DataTable, Footer, Input, Static
 
 from enact_dist.cli.top.tables import TABLES, TopTable, headline
 from enact_dist.operate.cell_rates import pause_s
+from enact_dist.operate.cell_rows import CellRates
 from enact_dist.wire.texts import shown
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from enact_dist.operate.cell_rows import CellRates
 
 ROWS_SHOWN_MAX: Final = 500
 """Rows of one panel; the title counts the others, which a filter brings up."""

@@ -5,8 +5,9 @@ A lock is begun under a plan, which splits what was requested by shard.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import repeat
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from enact_dist.core.client.kept import Keeping, KeptGrant
 from enact_dist.core.client.lease_clock import shortened_ns
@@ -14,14 +15,10 @@ from enact_dist.core.client.lock import MultiLock
 from enact_dist.core.client.plan import Phase, Plan, Reading
 from enact_dist.core.client.session import ClientSession
 from enact_dist.core.protocol.datum import LockId
+from enact_dist.core.protocol.messages import Item, PlacementMap
 from enact_dist.core.protocol.placement import shard_of
 from enact_dist.core.state.tenure import is_keepable
 from enact_dist.terms import ACCESSES, Access
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from enact_dist.core.protocol.messages import Item, PlacementMap
 
 PLANNED_MAX: Final = 32
 PLANS_MAX: Final = 256

@@ -11,36 +11,35 @@ One session per process, one lane per thread.  Rules a change must keep:
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 from enact_dist.core.client.kept import OwnGrants
 from enact_dist.core.client.lease_clock import Sendings
 from enact_dist.core.client.own_commits import Unsettled
-from enact_dist.core.client.plan import Phase
+from enact_dist.core.client.plan import Part, Phase, Plan
+from enact_dist.core.protocol.datum import LockId
 from enact_dist.core.protocol.messages import (
     START,
     Acquire,
     Alive,
     Answer,
+    AspectEntry,
+    DatumRead,
     EpochChanged,
     Hello,
     KeepAlive,
     KeepVersions,
     LaneView,
     PlacementMap,
+    Prepared,
     Registered,
+    Request,
     Welcome,
 )
 from enact_dist.core.state.clock import STAMP_NS_MAX, is_older
 from enact_dist.terms import Durability
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-
-    from enact_dist.core.client.plan import Part, Plan
-    from enact_dist.core.protocol.datum import LockId
-    from enact_dist.core.protocol.messages import AspectEntry, DatumRead, Prepared, Request
 
 
 class HeldThere(Protocol):

@@ -6,9 +6,11 @@ tests compare the real store with it.
 
 from __future__ import annotations
 
+from collections.abc import Collection, Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from enact_dist.core.protocol.datum import LockId, Slot
 from enact_dist.core.protocol.records import (
     AspectForgotten,
     AspectRecord,
@@ -24,6 +26,7 @@ from enact_dist.core.protocol.records import (
     OutcomeRecord,
     PreparedEnded,
     PreparedRecord,
+    Record,
     Recovered,
     SessionEnded,
     SessionRecord,
@@ -31,12 +34,6 @@ from enact_dist.core.protocol.records import (
     WorldDropped,
     WorldRecord,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable
-
-    from enact_dist.core.protocol.datum import LockId, Slot
-    from enact_dist.core.protocol.records import Record
 
 
 class Ledger:

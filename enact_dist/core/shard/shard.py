@@ -14,7 +14,8 @@ ours.  Its rule *one lock per thread* is the lane: a newer seq ends the older on
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, cast
+from collections.abc import Callable, Iterable, Iterator
+from typing import Final, cast
 
 from enact_dist.core.protocol.checks import wrong_patterns
 from enact_dist.core.protocol.messages import (
@@ -42,6 +43,7 @@ from enact_dist.core.protocol.messages import (
     ListPlaces,
     ListRefusals,
     ListSessions,
+    Notice,
     Outcome,
     Ping,
     Places,
@@ -50,6 +52,7 @@ from enact_dist.core.protocol.messages import (
     Refused,
     Register,
     Release,
+    Request,
     Resolve,
     Stage,
     Survey,
@@ -61,6 +64,7 @@ from enact_dist.core.protocol.records import (
     Called,
     Drain,
     Effect,
+    Event,
     MakeRoom,
     Persisted,
     Publish,
@@ -74,6 +78,7 @@ from enact_dist.core.protocol.records import (
     ShardReturned,
     Tick,
 )
+from enact_dist.core.rights.rules import Rights
 from enact_dist.core.shard import inspection, owners
 from enact_dist.core.shard.on_history import HistoryDesk, LineageDesk
 from enact_dist.core.shard.on_lock import LockDesk
@@ -86,13 +91,6 @@ from enact_dist.core.shard.state import ShardSettings, ShardState
 from enact_dist.core.state.audit import BROKEN, SETTLED
 from enact_dist.core.state.grants import HELD_TOO_LONG
 from enact_dist.terms import Durability
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
-
-    from enact_dist.core.protocol.messages import Notice, Request
-    from enact_dist.core.protocol.records import Event
-    from enact_dist.core.rights.rules import Rights
 
 _DECIDE: Final = frozenset((Persisted, Called, Drain))
 """After these, what was undecided may be decided; without a store after any message."""

@@ -12,17 +12,14 @@ answer about a lock that is neither decided nor held is *aborted* (presumed abor
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from enact_dist.core.protocol.datum import LockId, Position
 from enact_dist.core.protocol.messages import Finish
 from enact_dist.core.protocol.records import Call, DecisionDone, DecisionRecord, Effect, Persist
 from enact_dist.terms import Durability
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
-
-    from enact_dist.core.protocol.datum import LockId, Position
 
 AGAIN_NS_MIN: Final = 200_000_000
 AGAIN_NS_MAX: Final = 2_000_000_000

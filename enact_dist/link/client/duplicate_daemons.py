@@ -11,8 +11,9 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from enact_dist.core.protocol.messages import ListPlaces, Ping, Places, Pong, ShardEntry
 from enact_dist.core.protocol.records import Compare, Served
@@ -20,11 +21,7 @@ from enact_dist.errors import ConfigError, ShardUnreachableError
 from enact_dist.link.zenoh.config import to_reach
 from enact_dist.link.zenoh.discovery import FoundShard, ask_shards
 from enact_dist.link.zenoh.endpoints import PROTOCOLS, somebody_listens, split_endpoint
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
-
-    from enact_dist.link.zenoh.tls import KeyFiles
+from enact_dist.link.zenoh.tls import KeyFiles
 
 _log = logging.getLogger("enact.link")
 

@@ -14,9 +14,12 @@ import logging
 import signal
 import sys
 import threading
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
+
+import zenoh
 
 from enact_dist.errors import EnactError, LinkError, StoreError
 from enact_dist.link.daemon.daemon import (
@@ -29,18 +32,12 @@ from enact_dist.link.daemon.daemon import (
 )
 from enact_dist.link.daemon.reload import Reload, checked_keys
 from enact_dist.link.daemon.service_manager import ServiceManager
+from enact_dist.link.daemon.settings import DaemonSettings
 from enact_dist.link.log import READY, STANDS_BY, Log, say
 from enact_dist.link.postgres.address import require_driver
 from enact_dist.link.signals import StopSignals
 from enact_dist.link.zenoh.config import close_session
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    import zenoh
-
-    from enact_dist.link.daemon.settings import DaemonSettings
-    from enact_dist.link.zenoh.tls import Certificate
+from enact_dist.link.zenoh.tls import Certificate
 
 SWITCH_INTERVAL_S: Final = 0.0002
 """With Python's 5 ms a busy store thread would add 7 to 11 ms to a call (p90), measured."""

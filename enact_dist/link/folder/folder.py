@@ -8,20 +8,17 @@ from __future__ import annotations
 
 import logging
 import shutil
-from typing import TYPE_CHECKING, Final, NamedTuple, NoReturn
+from pathlib import Path
+from typing import Final, NamedTuple, NoReturn
 
 from enact_dist.core.offline.moving import NAMED_MAX, strangers
+from enact_dist.core.protocol.messages import PlacementMap
+from enact_dist.core.protocol.records import Recovered
 from enact_dist.core.state.clock import AHEAD_NS_MAX, STAMP_NS_MAX, newest_stamp
 from enact_dist.errors import StoreError
 from enact_dist.link.folder.lock import FORMAT_FILE
 from enact_dist.link.folder.mark import MARK_FILE, Mark, read_mark
 from enact_dist.link.folder.wal_check import check_wal
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from enact_dist.core.protocol.messages import PlacementMap
-    from enact_dist.core.protocol.records import Recovered
 
 DATABASE_FILE: Final = "store.db"
 LOG_FILE: Final = "store.db-wal"

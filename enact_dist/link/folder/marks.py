@@ -9,16 +9,14 @@ from __future__ import annotations
 
 import json
 import uuid
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from enact_dist.errors import StoreError
 from enact_dist.link.folder.folder import refuse
 from enact_dist.link.folder.lock import replace_file, sync_folder
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-    from pathlib import Path
 
 MOVING_FILE: Final = "moving"
 REBALANCE: Final = "rebalance"

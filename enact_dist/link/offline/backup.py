@@ -20,11 +20,13 @@ import dataclasses
 import errno
 import os
 import time
+from collections.abc import Iterable
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
+from enact_dist.core.protocol.records import Recovered
 from enact_dist.errors import StoreError
 from enact_dist.link.folder.blobs import BlobFolder
 from enact_dist.link.folder.folder import (
@@ -60,11 +62,6 @@ from enact_dist.link.offline.backup_files import (
 from enact_dist.link.store.medium import FULL_ERRNOS, file_in, folder_errors, open_database
 from enact_dist.link.store.recovery import put_together, read_blobs
 from enact_dist.link.store.store import open_store, read_store
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from enact_dist.core.protocol.records import Recovered
 
 DIGESTS: Final = "digests"
 TRIES_MAX: Final = 50

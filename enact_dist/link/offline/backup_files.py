@@ -23,17 +23,15 @@ import os
 import re
 import shutil
 import stat
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from pathlib import Path
+from typing import Any, Final, NamedTuple
 
 from enact_dist.errors import StoreError
 from enact_dist.link.folder.folder import BLOB_FOLDER, DATABASE_FILE, LOG_FILE
 from enact_dist.link.folder.lock import FORMAT_FILE
 from enact_dist.link.folder.mark import MARK_FILE
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
-    from pathlib import Path
 
 FILE_MODE: Final = 0o600
 FOLDER_MODE: Final = 0o700

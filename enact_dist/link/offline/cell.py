@@ -6,17 +6,15 @@ While a folder is marked (`link.folder.marks`), no shard starts from it.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING, Any, Final
+from pathlib import Path
+from typing import Any, Final
 
 from enact_dist.core.protocol.records import Persist, Record, Recovered
 from enact_dist.errors import StoreError
 from enact_dist.link.store.store import Store, open_store, read_store
 from enact_dist.terms import Durability
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
-    from pathlib import Path
 
 
 class _Silent:

@@ -8,16 +8,21 @@ nothing to complete.  The rules of `link.offline.rebalance` about epochs and old
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import psycopg
 from psycopg.types.numeric import Int8
 
 from enact_dist.config.types import without_password
+from enact_dist.core.failover.lease import HolderRow
 from enact_dist.core.offline.forgetting import world_drops
 from enact_dist.core.offline.moving import Shards
+from enact_dist.core.protocol.messages import PlacementMap
+from enact_dist.core.protocol.records import Recovered
 from enact_dist.errors import StoreError
+from enact_dist.link.folder.blobs import Blob
 from enact_dist.link.offline.cell import SILENT, refuse_obstacles, write
 from enact_dist.link.offline.forgetting import Purged, PurgeProgress, planned_purge
 from enact_dist.link.offline.rebalance import Progress, Rebalance, carry_out, wait_for_leases
@@ -28,16 +33,8 @@ from enact_dist.link.postgres.medium import database_errors, send_batch
 from enact_dist.link.postgres.opening import read_whole
 from enact_dist.link.postgres.restored import idle_rows, refuse_served, rows_of_cell
 from enact_dist.link.postgres.tables import ERASE, FENCE, MISSING, SHARDS, make_tables
+from enact_dist.link.store.database import DatabaseRow
 from enact_dist.link.store.store import Store
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-
-    from enact_dist.core.failover.lease import HolderRow
-    from enact_dist.core.protocol.messages import PlacementMap
-    from enact_dist.core.protocol.records import Recovered
-    from enact_dist.link.folder.blobs import Blob
-    from enact_dist.link.store.database import DatabaseRow
 
 _STOP: Final = "stop all daemons of the cell first; nothing was changed"
 

@@ -16,20 +16,17 @@ See `link.offline.cell`.  Rules that a change must keep:
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import groupby
-from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
+from pathlib import Path
+from typing import Final, NamedTuple, Protocol
 
 from enact_dist.core.offline.moving import Move, MovePlan, Shards
+from enact_dist.core.protocol.messages import PlacementMap
+from enact_dist.core.protocol.records import Recovered
 from enact_dist.link.folder.marks import mark, under_way, unmark
 from enact_dist.link.offline.cell import SILENT, opened, refuse_obstacles, write
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
-    from pathlib import Path
-
-    from enact_dist.core.protocol.messages import PlacementMap
-    from enact_dist.core.protocol.records import Recovered
-    from enact_dist.link.store.store import Store
+from enact_dist.link.store.store import Store
 
 BATCH_BYTES: Final = 32 << 20
 """About so many bytes move at once; a larger entity moves alone."""

@@ -17,20 +17,17 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Iterator
+from typing import Any, Final
 
 import psycopg
 
 from enact_dist.errors import StoreError
+from enact_dist.link.postgres.address import StoreAddress
 from enact_dist.link.postgres.connection import LOST, DatabaseSession, connector_of
 from enact_dist.link.postgres.tables import LISTED, NEWER, ROWS, THESE, state_of_shard
 from enact_dist.link.store.database import DatabaseRow
 from enact_dist.link.store.gathering import Rows, check_row
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from enact_dist.link.postgres.address import StoreAddress
 
 READ_S: Final = 0.25
 """How often new rows are read."""

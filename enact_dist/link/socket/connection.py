@@ -10,8 +10,9 @@ from __future__ import annotations
 import logging
 import socket
 import threading
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import Final, Protocol
 
+from enact_dist.core.protocol.datum import Slot
 from enact_dist.core.protocol.messages import (
     PERMISSION,
     Answer,
@@ -42,9 +43,6 @@ from enact_dist.link.socket.watcher import Publisher, SocketWatcher
 from enact_dist.link.zenoh.access import refuse_other_name
 from enact_dist.patterns import checked_patterns
 from enact_dist.wire.frames import decode_frame, decode_request
-
-if TYPE_CHECKING:
-    from enact_dist.core.protocol.datum import Slot
 
 OPEN_S: Final = 1.0
 """How long a new connection may take to name its session."""

@@ -16,8 +16,10 @@ import os
 import shutil
 import sqlite3
 import stat
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 from enact_dist.errors import StoreError
 from enact_dist.link.folder.blobs import Blob, BlobFolder
@@ -38,14 +40,9 @@ from enact_dist.link.folder.lock import FolderLock, check_format, sync_folder
 from enact_dist.link.folder.mark import MarkFile
 from enact_dist.link.folder.wal_check import commit_ends
 from enact_dist.link.store.database import Database, DatabaseRow, is_damage
+from enact_dist.link.store.gathering import Contents
 from enact_dist.link.store.recovery import put_together, read_blobs, read_contents
 from enact_dist.link.store.rows import EPOCH_KEY
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-    from pathlib import Path
-
-    from enact_dist.link.store.gathering import Contents
 
 LOG_BYTES: Final = 8 << 20
 """Approximate size of the log at which it is carried into the database."""

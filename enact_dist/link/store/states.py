@@ -7,16 +7,13 @@ several states.  Each is kept until the last of these rows is deleted.
 from __future__ import annotations
 
 from collections import Counter, OrderedDict
-from typing import TYPE_CHECKING, Final, NamedTuple
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from typing import Final, NamedTuple
 
+from enact_dist.core.protocol.datum import LockId, Slot
+from enact_dist.core.protocol.records import SlotRecord
+from enact_dist.link.folder.blobs import Blob
 from enact_dist.link.store.rows import Key, RowKind, key_of
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Mapping
-
-    from enact_dist.core.protocol.datum import LockId, Slot
-    from enact_dist.core.protocol.records import SlotRecord
-    from enact_dist.link.folder.blobs import Blob
 
 OUTCOMES_KEPT_NS: Final = 24 * 3600 * 1_000_000_000
 """How long the outcomes of an ended session can be asked for."""

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
+import argparse
 import shutil
 import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from enact_dist.cli.text.output import print_json, print_table
 from enact_dist.cli.verbs import DONE, FAILED
 from enact_dist.verify.chaos import runner
 from enact_dist.verify.chaos.evidence import load
 from enact_dist.verify.chaos.figures import FACTS_MAX, Verdict, judge
-
-if TYPE_CHECKING:
-    import argparse
 
 SECONDS: Final = 60.0
 """Default duration of a run."""

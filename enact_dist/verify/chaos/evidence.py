@@ -14,7 +14,8 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Final
+from pathlib import Path
+from typing import Any, Final
 
 from enact_dist.errors import ConfigError
 from enact_dist.verify.chaos import watcher
@@ -22,10 +23,6 @@ from enact_dist.verify.chaos.journal import SUFFIX, read_lines
 from enact_dist.verify.chaos.replicated.answers import SUFFIX as ANSWERS
 from enact_dist.verify.chaos.replicated.answers import ServedEpoch, read_answers
 from enact_dist.verify.checker import LockOutcome
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
 
 SETTINGS: Final = "settings.json"
 FAULTS: Final = "faults.log"

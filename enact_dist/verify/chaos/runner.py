@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import os
 import time
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 from enact_dist.config.types import without_password
 from enact_dist.errors import ConfigError, LinkError
@@ -20,11 +22,6 @@ from enact_dist.verify.chaos.network.hosts import open_hosts
 from enact_dist.verify.chaos.replicated import daemon as replicated_daemon
 from enact_dist.verify.chaos.replicated.stage import NODES, stage_replicated
 from enact_dist.verify.checker import LockOutcome
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-    from pathlib import Path
-
 
 TTL_S: Final = 1.0
 CLIENTS_PER_HOST: Final = 2

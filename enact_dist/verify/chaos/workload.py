@@ -10,7 +10,7 @@ from __future__ import annotations
 import random
 import time
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import Any, Final, cast
 
 from enact_dist import (
     Aspect,
@@ -36,11 +36,9 @@ from enact_dist.errors import (
     LockTimeoutError,
     ShardUnreachableError,
 )
+from enact_dist.terms import LockRequest, LockRequestOne
 from enact_dist.verify.chaos.journal import UNSEEN, Journal
 from enact_dist.verify.checker import LockOutcome
-
-if TYPE_CHECKING:
-    from enact_dist.terms import LockRequest, LockRequestOne
 
 WORLDS: Final = ("online", "training")
 ASPECTS: Final = {

@@ -5,15 +5,12 @@ Every attack is made of frames that any program can send which reaches the shard
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from enact_dist.verify.floods import forgeries, overloads
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from enact_dist.verify.floods.attacker import Attacker
+from enact_dist.verify.floods.attacker import Attacker
 
 
 @dataclass(frozen=True, slots=True)

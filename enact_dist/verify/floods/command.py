@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
-from typing import TYPE_CHECKING
 
 from enact_dist.cli.text.output import print_json, print_table
 from enact_dist.cli.verbs import DONE, FAILED, USAGE
 from enact_dist.verify.floods.attacks import ATTACKS
 from enact_dist.verify.floods.run import P99_MS_MAX, Figures, measure
-
-if TYPE_CHECKING:
-    import argparse
 
 
 def run(arguments: argparse.Namespace) -> int:

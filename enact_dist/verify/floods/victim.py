@@ -17,18 +17,15 @@ import os
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from enact_dist.access.lock import Lock
 from enact_dist.errors import EnactError
 from enact_dist.terms import Aspect, Durability, Entity, Write
+from enact_dist.world.cell import Cell
 from enact_dist.world.connecting import connect
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from enact_dist.world.cell import Cell
 
 ACTOR: Final = "victim"
 COUNT: Final = Aspect("count", int, Durability.VOLATILE)

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
 import time
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from enact_dist.cli.text.output import print_json
 from enact_dist.cli.verbs import DONE, FAILED
 from enact_dist.verify.frames.lives import BrokenLife, LifeTally, live
 from enact_dist.verify.simulation.series import fresh_seed
-
-if TYPE_CHECKING:
-    import argparse
 
 SECONDS: Final = 60.0
 """Default duration."""

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
+import argparse
 import os
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from enact_dist.cli.text.output import print_json
 from enact_dist.cli.verbs import DONE, FAILED
 from enact_dist.verify.simulation.command import INTERRUPTED, SEEDS, as_json, told_progress
+from enact_dist.verify.simulation.scenario import Result
 from enact_dist.verify.simulation.schedule import WHOLE
 from enact_dist.verify.simulation.series import Totals, fresh_seed, run_series
 from enact_dist.verify.simulation.shrink import Shrunk
 from enact_dist.verify.takeover.run import TakeoverRun, run_takeover
 from enact_dist.world.trees import shown_s
-
-if TYPE_CHECKING:
-    import argparse
-
-    from enact_dist.verify.simulation.scenario import Result
 
 _SHOWN: Final = (
     ("takeovers", "takeovers"),

@@ -7,17 +7,14 @@ failover keeps what the standby has: all that was confirmed, and perhaps more.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from enact_dist.core.failover.lease import HolderRow
+from enact_dist.core.protocol.records import Persist
 from enact_dist.verify.simulation.hosts.world import MS, Host, SimulatedWorld
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from enact_dist.core.protocol.records import Persist
 
 ARRIVES = 0.5
 """Share of the statements that arrive although their connection broke on the way."""

@@ -9,19 +9,16 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from enact_dist.cli import main
 from enact_dist.core.protocol.records import Effect, Persist, Story
 from enact_dist.link.lease import AnswerGate
 from enact_dist.link.postgres import opening
+from enact_dist.link.postgres.address import FreeShard
 from enact_dist.verify.chaos.replicated.answers import AnswerTimes
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from enact_dist.link.postgres.address import FreeShard
 
 MODULE: Final = "enact_dist.verify.chaos.replicated.daemon"
 FENCED: Final = "fenced "

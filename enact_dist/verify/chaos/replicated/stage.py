@@ -4,24 +4,21 @@ from __future__ import annotations
 
 import os
 import time
-from typing import TYPE_CHECKING, Final, NamedTuple
+from collections.abc import Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Final, NamedTuple
 
 from enact_dist.errors import LinkError, StoreError
 from enact_dist.link.postgres.address import StoreAddress, require_driver
 from enact_dist.verify.chaos.faults import StagedRun
+from enact_dist.verify.chaos.journal import Journal
 from enact_dist.verify.chaos.network.hosts import Hosts, Loopback, Namespaces
 from enact_dist.verify.chaos.replicated.cell import ReplicatedCell
 from enact_dist.verify.chaos.replicated.cuts import SharedCuts
 from enact_dist.verify.chaos.replicated.database_faults import DatabaseFaults
 from enact_dist.verify.chaos.replicated.faults import DECK, ReplicatedFaults
 from enact_dist.verify.chaos.replicated.nodes import USER, DatabaseNode, DatabasePair, programs
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from contextlib import ExitStack
-    from pathlib import Path
-
-    from enact_dist.verify.chaos.journal import Journal
 
 NODES: Final = "nodes"
 """In place of an address: two servers of the run's own."""
