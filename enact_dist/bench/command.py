@@ -8,7 +8,6 @@ import os
 import platform
 import signal
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -26,7 +25,7 @@ from enact_dist.bench.cases.security import run_security
 from enact_dist.bench.cases.updates import run_durable, run_multi, run_update, run_waiters
 from enact_dist.bench.cases.workcell import run_workcell
 from enact_dist.bench.floors import Floors
-from enact_dist.bench.place import EMBEDDED, Place
+from enact_dist.bench.place import EMBEDDED, Place, folders
 from enact_dist.bench.rows import Row, shown_spread, shown_us
 from enact_dist.bench.run import Answer, PackingOptions, Run
 from enact_dist.bench.tables import table
@@ -36,7 +35,6 @@ from enact_dist.cli.text.benches import BENCHES as TOLD
 from enact_dist.cli.text.output import print_json, print_table
 from enact_dist.cli.verbs import DONE, FAILED
 from enact_dist.errors import EnactError, MisuseError
-from enact_dist.link.memory.shared_folder import MEMORY
 
 SECONDS_S: Final = 3.0
 """Measuring time of each line unless given."""
@@ -132,11 +130,7 @@ def run(arguments: argparse.Namespace) -> int:
     names = names_of(arguments)
     found = machine()  # its load is that of others, before this adds its own
     with _ends_in_order(), contextlib.ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="enact-bench-")))
-        memory_root = MEMORY if MEMORY.is_dir() else None
-        memory = Path(
-            stack.enter_context(tempfile.TemporaryDirectory(prefix="enact-bench-", dir=memory_root))
-        )
+        folder, memory = stack.enter_context(folders())
         place = stack.enter_context(
             Place(
                 folder,

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.bench.echoes.socket_echo import SocketEcho
 from enact_dist.bench.rows import FLOOR, Case, Key
-from enact_dist.bench.timing import PAUSE_S, timed
+from enact_dist.bench.timing import PAUSE_S, repeating
 from enact_dist.errors import MisuseError
 from enact_dist.verify.daemons import KeptPorts, LineProcess
 
@@ -106,9 +106,7 @@ class Floors:
         pause_s = PAUSE_S if bare != variant else 0.0
         act = self._act(bare)
         moved = 0 if bare.startswith("mmap") else SIZES.get(size_of(bare), 0)
-        return Case(
-            FLOOR, variant, lambda seconds_s: timed(act, seconds_s, pause_s=pause_s), bytes=moved
-        )
+        return Case(FLOOR, variant, repeating(act, pause_s=pause_s), bytes=moved)
 
     def _act(self, variant: str) -> Callable[[], object]:
         if variant == "zenoh query":

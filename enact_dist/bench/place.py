@@ -8,6 +8,7 @@ import os
 import signal
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
@@ -93,7 +94,11 @@ class Place:
         self._stack = contextlib.ExitStack()
         self._logs = 0
         self._daemons: list[LineProcess] = []
-        self._visit = Visit(target, connected=self._anew, said=said) if target else None
+        self._visit = (
+            Visit(target, connected=lambda: self._opened(self.carrier), said=said)
+            if target
+            else None
+        )
         if self.own and shared is not None:
             # No other files are there: what it grows by is ours.
             shared.mkdir(mode=0o700)
@@ -204,10 +209,6 @@ class Place:
         with environment(**{CARRIER_VARIABLE: carrier}):
             return connect(target, actor="bench", timeout_s=JOIN_S)
 
-    def _anew(self) -> Cell:
-        with environment(**{CARRIER_VARIABLE: self.carrier}):
-            return connect(self.target, actor="bench", timeout_s=JOIN_S)
-
     def _joined(self, carrier: str) -> str:
         """Return what workers connect to, once this process has joined it: they would die of it."""
         if not self.own:
@@ -314,19 +315,22 @@ def secure(file: Path, names: int) -> None:
 
 
 @contextlib.contextmanager
+def folders() -> Iterator[tuple[Path, Path]]:
+    """Give two empty folders, on disk and in shared memory; both go at the end of the block."""
+    made = partial(tempfile.TemporaryDirectory, prefix="enact-bench-")
+    with made() as disk, made(dir=MEMORY if MEMORY.is_dir() else None) as memory:
+        yield Path(disk), Path(memory)
+
+
+@contextlib.contextmanager
 def fresh_place(carrier: str = "auto", *, names: int = 0) -> Iterator[tuple[Place, Path]]:
     """Give a cell of one daemon that has served nothing before, and its shared folder.
 
     See `Place` for `names`.
     """
-    root = MEMORY if MEMORY.is_dir() else None
-    with contextlib.ExitStack() as stack:
-        folder, memory = (
-            Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="enact-bench-", dir=at)))
-            for at in (None, root)
-        )
+    with folders() as (folder, memory):
         shared = memory / "shared"
-        place = Place(
+        with Place(
             folder, target=None, shards=1, carriers=(carrier,), shared=shared, names=names
-        )
-        yield stack.enter_context(place), shared
+        ) as place:
+            yield place, shared

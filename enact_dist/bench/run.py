@@ -132,7 +132,7 @@ class Run:
         for number in range(rounds):
             for case in every:
                 self.told(f"{case.name}: {case.variant} ({number + 1} of {rounds})")
-                self._keep(case, self._measured(case, self.seconds_s / rounds))
+                self.add(case, self._measured(case, self.seconds_s / rounds))
 
     @staticmethod
     def _measured(case: Case, seconds_s: float) -> Sequence[float]:
@@ -141,17 +141,14 @@ class Run:
         gc.collect()
         return case.measure(seconds_s)
 
-    def _keep(self, case: Case, times_us: Sequence[float]) -> None:
+    def add(self, case: Case, times_us: Sequence[float]) -> None:
+        """Add what was measured of a case, here or elsewhere."""
         self._cases.setdefault(case.key, case)
         before = self._figures.get(case.key)
         rounds_us = (*(before.rounds_us if before else ()), sample_of(times_us).median_us)
         every_us = self._times_us.setdefault(case.key, [])
         every_us += times_us
         self._figures[case.key] = replace(sample_of(every_us), rounds_us=rounds_us)
-
-    def add(self, case: Case, times_us: Sequence[float]) -> None:
-        """Add a case that was measured elsewhere."""
-        self._keep(case, times_us)
 
     def add_row(self, row: Row) -> None:
         """Add a figure that is no time."""

@@ -10,15 +10,13 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, TypeAlias
+from typing import Any, TypeAlias
 
-from enact_dist.bench.rows import FLOOR, shown_spread, shown_us
+from enact_dist.bench.rows import FLOOR, TIME_FIELDS, shown_spread, shown_us
 from enact_dist.errors import MisuseError
 
 Found: TypeAlias = dict[tuple[str, str], dict[str, Any]]
 """The rows of one run by bench and variant."""
-
-FIELDS: Final = ("name", "variant", "median_us", "p99_us", "n", "ratio", "goal", "met")
 
 
 def read_run(path: Path) -> tuple[dict[str, Any], Found]:
@@ -30,7 +28,7 @@ def read_run(path: Path) -> tuple[dict[str, Any], Found]:
     try:
         told = json.loads(path.read_text())
         rows = {(row["name"], row["variant"]): row for row in told["rows"]}
-        if any(set(FIELDS) - set(row) for row in rows.values()):
+        if any(set(TIME_FIELDS) - set(row) for row in rows.values()):
             raise KeyError("rows")
         return dict(told["machine"]), rows
     except OSError as error:

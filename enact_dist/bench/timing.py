@@ -45,6 +45,16 @@ def timed(
     return times_us
 
 
+def repeating(
+    act: Callable[[], object],
+    *,
+    pause_s: float = 0.0,
+    before: Callable[[], object] | None = None,
+) -> Callable[[float], list[float]]:
+    """Return what times an act for so many seconds, see `timed`: the measure of a case."""
+    return lambda seconds_s: timed(act, seconds_s, pause_s=pause_s, before=before)
+
+
 def _warm(act: Callable[[], object], seconds_s: float, before: Callable[[], object] | None) -> None:
     end_s = time.perf_counter() + seconds_s / 10.0
     for _ in range(WARM_MAX):

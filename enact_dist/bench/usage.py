@@ -16,11 +16,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from enact_dist.bench.rows import Row, value_row
+
 WARM_UP_S: Final = 10.0
 """Samples of the first so many seconds say nothing about growth."""
 SAMPLES: Final = 60
 SAMPLES_MIN: Final = 5
 """From fewer samples after the warm-up, or in a shorter time than it, no growth is reported."""
+GROWTH_MAX: Final = 50_000.0
+"""Bytes per second that noise may look like; one image that stays per second is 18 times that."""
 KINDS_OF_MEMORY: Final = {"RssAnon:": "private", "RssShmem:": "shared"}
 
 
@@ -90,6 +94,27 @@ class Usage:
         if last_s - first_s < 2 * WARM_UP_S or len(left) < SAMPLES_MIN:
             return None
         return slope([(one.at_s, figure(one)) for one in left])
+
+
+def growth_row(
+    usage: Usage,
+    name: str,
+    variant: str,
+    figure: Callable[[Sampled], float],
+    note: str = "after 10 s",
+) -> Row:
+    """Return the row of a figure in bytes that should not grow after the warm-up."""
+    grown = usage.growth(figure)
+    return value_row(
+        name,
+        variant,
+        round((grown or 0.0) / 1e3, 1) + 0.0,
+        "kB/s",
+        len(usage.samples),
+        f"none (≤ {GROWTH_MAX / 1e3:g} kB/s)",
+        met=None if grown is None else grown <= GROWTH_MAX,
+        note=note if grown is not None else "too short to tell",
+    )
 
 
 def slope(points: Sequence[tuple[float, float]]) -> float:

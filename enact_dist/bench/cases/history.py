@@ -11,6 +11,7 @@ import contextlib
 import json
 import threading
 import time
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -19,8 +20,8 @@ from enact_dist.access.lock import Lock
 from enact_dist.bench.cases.updates import WAIT_S, floor_of, update
 from enact_dist.bench.place import EMBEDDED, WORLD, Place, environment, fresh_place
 from enact_dist.bench.rows import Case, Goal, Key, times, value_row
-from enact_dist.bench.timing import timed
-from enact_dist.bench.usage import Usage
+from enact_dist.bench.timing import repeating, timed
+from enact_dist.bench.usage import Usage, growth_row
 from enact_dist.errors import UnknownWorldError
 from enact_dist.retention import Retention
 from enact_dist.terms import Aspect, Durability, Entity, View, Write
@@ -58,8 +59,6 @@ BLOCK_TICKS: Final = 20
 HEAD_START_NS: Final = 1_500_000_000
 PAUSE_S: Final = 0.005
 CAP_BYTES: Final = 256_000_000
-GROWTH_MAX: Final = 50_000.0
-"""Bytes per second that noise may look like; one image that stays per second is 18 times that."""
 CAP_VARIABLE: Final = "ENACT_SHARED_BYTES_MAX"
 
 IMAGES: Final[tuple[Aspect[Any], Aspect[Any]]] = (
@@ -94,9 +93,8 @@ def _updates(world: WorldContext, floor: Key, durability: Durability) -> Iterato
         write = Write(world, Entity("history"), aspect)
         for _ in range(versions or 1):
             update((write,))  # full from the first measured one on
-        yield Case(
-            NAME, _update(durability, label), _updating(write), floor, _cost(durability, label)
-        )
+        measure = repeating(partial(update, (write,)))
+        yield Case(NAME, _update(durability, label), measure, floor, _cost(durability, label))
 
 
 def _update(durability: Durability, label: str) -> str:
@@ -107,14 +105,6 @@ def _cost(durability: Durability, label: str) -> Goal | None:
     if KEPT[label] == 1:
         return None
     return times(1.1, (NAME, _update(durability, SIDES[1])), ITS_COST)
-
-
-def _updating(write: Write[int]) -> Measure:
-    return _repeating(lambda: update((write,)))
-
-
-def _repeating(act: Callable[[], object]) -> Measure:
-    return lambda seconds_s: timed(act, seconds_s)
 
 
 # ---------------------------------------------------------------- looks
@@ -138,7 +128,7 @@ def _looks(world: WorldContext, floor: Key) -> list[Case]:
         assert len(found) == MANY, len(found)
 
     return [
-        Case(NAME, what, _repeating(act), floor)
+        Case(NAME, what, repeating(act), floor)
         for what, act in (
             ("view of one slot as it is", lambda: world.view(views[0])),
             (f"view as of {MANY // 2} versions ago", lambda: past.view(views[1])),
@@ -252,16 +242,5 @@ def _add_memory(run: Run, measured: _Cameras) -> None:
             note=note,
         )
     )
-    grown = usage.growth(lambda one: one.kinds["shard"].private)
-    run.add_row(
-        value_row(
-            NAME,
-            f"8 cameras, {rate:.0f} MB/s, growth of the shard's own memory",
-            round((grown or 0.0) / 1e3, 1) + 0.0,
-            "kB/s",
-            len(usage.samples),
-            f"none (≤ {GROWTH_MAX / 1e3:g} kB/s)",
-            met=None if grown is None else grown <= GROWTH_MAX,
-            note="after 10 s" if grown is not None else "too short to tell",
-        )
-    )
+    what = f"8 cameras, {rate:.0f} MB/s, growth of the shard's own memory"
+    run.add_row(growth_row(usage, NAME, what, lambda one: one.kinds["shard"].private))

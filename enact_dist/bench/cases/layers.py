@@ -38,7 +38,7 @@ from enact_dist.bench.floors import PAUSED, SIZES, mapped, reply
 from enact_dist.bench.place import EMBEDDED
 from enact_dist.bench.rows import Case, Key
 from enact_dist.bench.run import ROUNDS, Run
-from enact_dist.bench.timing import COUNT_MAX, PAUSE_S, timed
+from enact_dist.bench.timing import COUNT_MAX, PAUSE_S, repeating
 from enact_dist.core.protocol.messages import Message
 from enact_dist.core.shard.shard import Shard
 from enact_dist.errors import LinkError
@@ -150,7 +150,7 @@ def run_layers(run: Run) -> None:
 
 
 def _whole(profile: Profile) -> Case:
-    measure = partial(timed, profile.act, before=profile.before)
+    measure = repeating(profile.act, before=profile.before)
     return Case(NAME, f"{profile.what}, whole", measure, profile.floor)
 
 
@@ -267,8 +267,6 @@ def _wire_cases(messages: Sequence[Message]) -> list[Case]:
             decode_frame(header, payload or b"")
 
     return [
-        Case(
-            NAME, f"wire, {len(frames)} frames written", lambda seconds_s: timed(write, seconds_s)
-        ),
-        Case(NAME, f"wire, {len(frames)} frames read", lambda seconds_s: timed(read, seconds_s)),
+        Case(NAME, f"wire, {len(frames)} frames written", repeating(write)),
+        Case(NAME, f"wire, {len(frames)} frames read", repeating(read)),
     ]

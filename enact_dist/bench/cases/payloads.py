@@ -28,7 +28,7 @@ from enact_dist.bench.cases.updates import floor_of
 from enact_dist.bench.floors import SIZES, mapped, reply, written
 from enact_dist.bench.place import EMBEDDED, WORLD
 from enact_dist.bench.rows import Case, Key, at_most, times
-from enact_dist.bench.timing import timed
+from enact_dist.bench.timing import repeating, timed
 from enact_dist.terms import Aspect, Durability, Entity, Read, World, Write
 
 if TYPE_CHECKING:
@@ -151,7 +151,7 @@ def _embedded_fetches(world: WorldContext) -> list[Case]:
 def _fetching(
     world: WorldContext, size: str, before: Callable[[], None] | None = None
 ) -> Callable[[float], Sequence[float]]:
-    return lambda seconds_s: timed(lambda: fetch(world, entity(size)), seconds_s, before=before)
+    return repeating(lambda: fetch(world, entity(size)), before=before)
 
 
 def _fetches(world: WorldContext, size: str, fresh: Storer) -> list[Case]:

@@ -24,7 +24,7 @@ from enact_dist.bench.floors import written
 from enact_dist.bench.place import PIPELINE_WORKER
 from enact_dist.bench.rows import Case, Row, at_most, value_row
 from enact_dist.bench.timing import sleep_until
-from enact_dist.bench.usage import Sampled, Usage
+from enact_dist.bench.usage import Sampled, Usage, growth_row
 from enact_dist.link.memory.shared_folder import shared_root
 
 if TYPE_CHECKING:
@@ -40,8 +40,6 @@ WARM_TICKS: Final = 15
 HEAD_START_NS: Final = 1_500_000_000
 END_S: Final = 60.0
 CORES_MAX: Final = 0.25
-GROWTH_MAX: Final = 50_000.0
-"""Bytes per second that noise may look like; one image that stays per second is 18 times that."""
 KINDS: Final = {"camera": "cameras", "segmenter": "workers", "consumer": "reader"}
 SHARD: Final = "shards"
 STAGES: Final = ("camera's wake-up", "image's commit", "worker", "reader")
@@ -117,8 +115,7 @@ def _add_memory(run: Run, usage: Usage) -> None:
         note = f"and {last.kinds[kind].shared / 1e6:.1f} MB shared"
         private = round(last.kinds[kind].private / 1e6, 1)
         run.add_row(value_row(NAME, f"memory of the {kind}", private, "MB", count, note=note))
-    n = len(usage.samples)
-    figures = {
+    figures: dict[str, Callable[[Sampled], float]] = {
         "growth of memory of their own": lambda one: sum(k.private for k in one.kinds.values()),
         "growth of shared memory": lambda one: sum(k.shared for k in one.kinds.values()),
         "growth of the shared folder": lambda one: one.files_bytes,
@@ -130,25 +127,11 @@ def _add_memory(run: Run, usage: Usage) -> None:
             note += ": " + ", ".join(f"{kind} {one / 1e3:.1f}" for kind, one in grown.items())
         if variant.endswith("folder"):
             note += f"; {last.files} files, {last.files_bytes / 1e6:.1f} MB at the end"
-        run.add_row(_growth_row(usage, variant, figure, n, note))
+        run.add_row(growth_row(usage, NAME, variant, figure, note))
 
 
 def _private_of(kind: str) -> Callable[[Sampled], float]:
     return lambda one: one.kinds[kind].private
-
-
-def _growth_row(usage: Usage, variant: str, figure: Any, n: int, note: str) -> Row:
-    grown = usage.growth(figure)
-    return value_row(
-        NAME,
-        variant,
-        round((grown or 0.0) / 1e3, 1) + 0.0,
-        "kB/s",
-        n,
-        f"none (≤ {GROWTH_MAX / 1e3:g} kB/s)",
-        met=None if grown is None else grown <= GROWTH_MAX,
-        note=note if grown is not None else "too short to tell",
-    )
 
 
 class _Measured:

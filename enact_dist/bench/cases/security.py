@@ -14,7 +14,7 @@ from enact_dist.bench.cases.payloads import fetch, floats, store
 from enact_dist.bench.cases.updates import slots, update
 from enact_dist.bench.place import CARRIER_VARIABLE, WORLD, Place, environment, fresh_place
 from enact_dist.bench.rows import Case, at_most, times
-from enact_dist.bench.timing import timed
+from enact_dist.bench.timing import repeating, timed
 from enact_dist.core.protocol.messages import Ping
 from enact_dist.core.rights.rules import Rights, Rule
 from enact_dist.link.client.fetch import DatumCache
@@ -64,7 +64,7 @@ def _near(what: str, world: WorldContext) -> Case:
     return Case(
         "security",
         f"{name}, {what}",
-        lambda seconds_s: timed(lambda: update(writes), seconds_s),
+        repeating(lambda: update(writes)),
         plain if what == LOCKED else None,
         times(1.1, plain, "≤ 1.1 x plain") if what == LOCKED else None,
     )
@@ -91,7 +91,7 @@ def _cases(what: str, world: WorldContext) -> list[Case]:
         Case(
             "security",
             f"{name}, {what}",
-            lambda seconds_s, act=act: timed(act, seconds_s),  # type: ignore[misc]  # its default
+            repeating(act),
             ("security", f"{name}, {PLAIN}") if what == LOCKED else None,
             times(factor, ("security", f"{name}, {PLAIN}"), text)
             if factor is not None and what == LOCKED
