@@ -137,13 +137,11 @@ def patterns_overlap(one: str, other: str) -> bool:
     return after[0]
 
 
-def pattern_contains(outer: str, inner: str) -> bool:
-    """Say whether `outer` covers all names that `inner` covers; never wrongly yes."""
-    return container(outer)(contained(inner)) is not None
-
-
 def container(pattern: str) -> Callable[[str], object]:
-    """Return a function of what `contained` returns; it returns None for what is not contained."""
+    """Return a function of what `contained` returns; it returns None for what is not contained.
+
+    A pattern is contained if `pattern` covers all names that it covers; never wrongly so.
+    """
     return re.compile(_source(pattern)).match
 
 

@@ -92,7 +92,6 @@ def check_actors(
     actors: Sequence[ActorDeclaration],
     *,
     worlds: Collection[str] = (),
-    aspects: Collection[str] = (),
     initial: Collection[str] = (),
 ) -> tuple[ActorFinding, ...]:
     """Check all declared reads and writes of a cell against each other.
@@ -100,7 +99,6 @@ def check_actors(
     Args:
         actors: Every actor that runs in the cell.
         worlds: World contexts of the cell; empty: any.
-        aspects: Aspects that the cell lists; empty: any.
         initial: Names of aspects that are written from outside (`init`, other programs).
 
     Returns:
@@ -110,7 +108,6 @@ def check_actors(
     findings = [
         *_roles(actors, worlds),
         *_entities(actors),
-        *_aspects(uses, aspects),
         *_types(uses),
         *_own_triggers(uses),
         *_writers(uses),
@@ -278,19 +275,6 @@ def _entities(actors: Iterable[ActorDeclaration]) -> Iterator[ActorFinding]:
             kind = "entity unsaid" if unsaid else "no such entity"
             text = f"actor {actor.name}: {error}"
             yield ActorFinding("warning" if unsaid else "error", kind, (actor.name,), text)
-
-
-def _aspects(uses: Iterable[Use], aspects: Collection[str]) -> Iterator[ActorFinding]:
-    for use in uses:
-        aspect = use.request.aspect.name
-        if aspects and aspect not in aspects:
-            yield ActorFinding(
-                "error",
-                "unknown aspect",
-                (use.actor.name,),
-                f"{use} uses the aspect {aspect}, which the cell does not list; it lists"
-                f" {', '.join(sorted(aspects))}",
-            )
 
 
 def _types(uses: Sequence[Use]) -> Iterator[ActorFinding]:

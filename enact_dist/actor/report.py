@@ -1,7 +1,7 @@
 """The report of a running actor: counters, rates, lock waits, its last error.
 
 `ActorStatistics` is a snapshot; `ActorRecord` collects (PURE: time arrives as an argument);
-`encode_reports` and `decode_reports` carry the snapshots of all actors of one process through
+`encode_reports` and `read_reports` carry the snapshots of all actors of one process through
 the session's keep-alive to `enact actor ls`.
 
 Memory is fixed when the actor starts: rates come from the newest `STAMPS_MAX` updates, lock waits
@@ -376,23 +376,6 @@ def _brief(row: dict[str, Any]) -> dict[str, Any]:
 
 def _named(row: dict[str, Any]) -> dict[str, Any]:
     return {name: row[name] for name in ("name", "state") if name in row}
-
-
-def decode_reports(report: bytes) -> tuple[ActorStatistics, ...]:
-    """Return what `encode_reports` packed; nothing of an empty report.
-
-    Raises:
-        ProtocolError: These bytes are no actor report.
-    """
-    if not report:
-        return ()
-    try:
-        found = msgpack.unpackb(report)
-    except (ValueError, OverflowError, msgpack.UnpackException) as error:
-        raise ProtocolError(
-            f"{len(report)} bytes {bytes(report[:16])!r}… are no actor report: {error}"
-        ) from error
-    return read_reports(found)
 
 
 def read_reports(report: Mapping[str, object]) -> tuple[ActorStatistics, ...]:

@@ -208,9 +208,9 @@ LOG: Final = option(
 )  # fmt: skip
 
 
-def counted(name: str, text: str, default: int | None = None, metavar: str = "N") -> Option:
+def counted(name: str, text: str, default: int | None = None) -> Option:
     """Return an option that takes a whole number above zero."""
-    return option(name, metavar, text, type=whole, default=default)
+    return option(name, "N", text, type=whole, default=default)
 
 
 def seconds_of(name: str, text: str, default: float | None = None, **settings: Any) -> Option:

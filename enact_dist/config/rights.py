@@ -223,13 +223,7 @@ def read_declared(file: Path) -> tuple[AllowTable, ...]:
     except OSError as error:
         problem = f"cannot read {file}: {error.strerror}; {REMEDY}"
         raise ConfigError(problem, path=str(file)) from error
-    except (
-        UnicodeDecodeError,
-        tomllib.TOMLDecodeError,
-        TypeError,
-        KeyError,
-        AttributeError,
-    ) as error:
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise ConfigError(f"{file} cannot be used: {error}; {REMEDY}", path=str(file)) from error
 
 

@@ -37,7 +37,6 @@ from typing import Any, Final
 
 from enact_dist.wire.texts import shown, shown_json
 
-FORMATS: Final = ("text", "json")
 TEXT: Final = "%(asctime)s %(levelname)s %(name)s %(message)s"
 READY: Final = "ready:"
 """First word of the line by which a shard or an actor reports that it is ready."""

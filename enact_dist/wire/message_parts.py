@@ -24,14 +24,12 @@ from enact_dist.errors import ProtocolError
 from enact_dist.wire.bodies import BodyReader, BodyWriter
 from enact_dist.wire.limits import (
     ENCODING_BYTES_MAX,
-    ENTRIES_MAX,
     INTEGER_MAX,
     ITEMS_MAX,
     KEPT_VERSIONS_MAX,
     NAME_CHARACTERS_MAX,
     REASON_CHARACTERS_MAX,
     REPORT_BYTES_MAX,
-    TEXT_BYTES_MAX,
 )
 
 Write = Callable[[Any, BodyWriter], Any]
@@ -71,12 +69,6 @@ LENGTHS_MAX_OF: Final = {
 }
 """The same where answers have longer fields of that name: to read 100,000 parts takes 0.6 s, for
 which a shard takes no other request over Zenoh."""
-LONGEST: Final[dict[type[Any], int]] = {
-    str: TEXT_BYTES_MAX,
-    bytes: TEXT_BYTES_MAX,
-    tuple: ENTRIES_MAX,
-}
-"""Longest content of all other fields by their type."""
 SCALARS: Final = frozenset({int, str, bytes, bool})
 
 

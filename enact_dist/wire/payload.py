@@ -132,11 +132,6 @@ def joined(parts: Sequence[bytes | memoryview], size: int) -> bytes | memoryview
     return body.data.toreadonly()
 
 
-def check_datum(value: object, datum_type: Any) -> None:
-    """Raise `DatumTypeError` if `value` is not of `datum_type`; the message names the part."""
-    _write(TreeWriter(), value, datum_type)
-
-
 def _write(writer: TreeWriter, value: object, datum_type: Any) -> bytes:
     """Return the encoding of a value; the writer then has the parts of its body."""
     shape = shape_of(datum_type)

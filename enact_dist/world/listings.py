@@ -319,7 +319,7 @@ def actor_infos(answers: Iterable[tuple[str, Answer | None]]) -> tuple[ActorInfo
                 (*(before.shards if before else ()), shard),
                 max(left_s, before.lease_left_s) if before else left_s,
                 info.locks + (before.locks if before else 0),
-                _report(info.report) or (before.report if before else {}),
+                unpacked_report(info.report) or (before.report if before else {}),
             )
     infos = sorted(found.values(), key=lambda info: (info.actor, info.session))
     return tuple(_with_namesakes(infos))
@@ -349,7 +349,7 @@ def _with_namesakes(infos: list[ActorInfo]) -> Iterator[ActorInfo]:
         yield replace(info, namesakes=others) if others else info
 
 
-def _report(encoded: bytes) -> dict[str, Any]:
+def unpacked_report(encoded: bytes) -> dict[str, Any]:
     """Return an actor's report; empty if invalid, since a client may send anything."""
     import msgpack
 

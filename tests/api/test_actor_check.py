@@ -133,16 +133,6 @@ def test_check_warns_when_nobody_writes_a_trigger_or_a_read():
     assert check(Reader, initial=["cloud", "surface"]) == ()
 
 
-def test_check_finds_an_unknown_aspect_when_the_cell_lists_its_aspects():
-    """A misspelt aspect is an error that lists those that exist."""
-    found = only(
-        check(Camera, Reconstruction, aspects=["clouds", "surface"], initial=["cloud"])[:1]
-    )
-
-    assert (found.level, found.kind) == ("error", "unknown aspect")
-    assert "it lists clouds, surface" in found.text
-
-
 @pytest.mark.parametrize(
     ("worlds", "kind"),
     [

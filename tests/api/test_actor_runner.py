@@ -14,7 +14,7 @@ from enact_dist.actor import binding as actor_binding
 from enact_dist.actor.actor import Actor
 from enact_dist.actor.binding import BoundActor
 from enact_dist.actor.inbox import Inbox, Watching
-from enact_dist.actor.report import decode_reports
+from enact_dist.actor.report import read_reports
 from enact_dist.actor.running.process import ActorThread, actor_command
 from enact_dist.actor.running.runner import run_actor
 from enact_dist.errors import (
@@ -27,6 +27,7 @@ from enact_dist.errors import (
 )
 from enact_dist.terms import Aspect, Entities, Entity, View, World, Write
 from enact_dist.world.connecting import local
+from enact_dist.world.listings import unpacked_report
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -426,9 +427,9 @@ def test_reports_of_all_actors_of_a_cell_are_shown_together(cell):
     ):
         wait_for_surface(cell, A, 10)
 
-    cell_report = cell._client.core.report
-    assert {report.name for report in decode_reports(cell_report)} == {"front", "back"}
-    assert {report.state for report in decode_reports(cell_report)} == {"stopped"}
+    found = read_reports(unpacked_report(cell._client.core.report))
+    assert {report.name for report in found} == {"front", "back"}
+    assert {report.state for report in found} == {"stopped"}
 
 
 def test_thread_raises_at_its_end_when_its_cell_was_closed(cell):

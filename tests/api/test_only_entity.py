@@ -224,6 +224,6 @@ def test_actors_of_one_class_are_told_apart_by_their_names():
 
 
 def test_command_of_a_process_names_the_entity():
-    """What `spawn_actor` starts works on the same one."""
+    """A process that it starts works on the same one."""
     command = actor_command("cameras:Camera", cell="cell.toml", entity="camera/7")
     assert command[-2:] == ["--entity", "camera/7"]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from enact_dist.cli.text import literals
 from enact_dist.errors import ConfigError, DatumTypeError, MisuseError
 from enact_dist.wire.fingerprint import fingerprint
-from enact_dist.wire.payload import check_datum
+from enact_dist.wire.payload import encode_datum
 
 TYPES = [
     int, float, bool, str, bytes, list, dict, np.ndarray, list[int], dict[str, float],
@@ -63,7 +63,7 @@ def test_literal_of_an_array_has_the_dtype_of_the_aspect():
 def test_whole_number_that_no_float_holds_is_refused_like_any_value():
     """It stays what it is, and the check of the datum names it."""
     with pytest.raises(DatumTypeError, match="asked float, found int 1000"):
-        check_datum(literals.read("1" + "0" * 400, float), float)
+        encode_datum(literals.read("1" + "0" * 400, float), float)
 
 
 def test_null_means_nothing():

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from enact_dist.core.rights import rules
 from enact_dist.core.rights.rules import UNPROVEN, Rights, Rule, data_path, fork_path
-from enact_dist.patterns import pattern_contains, pattern_matches
+from enact_dist.patterns import contained, container, pattern_matches
 
 LETTERS = st.text("ab*", min_size=1, max_size=4).filter(lambda text: "**" not in text)
 SEGMENTS = st.one_of(st.just("**"), LETTERS)
@@ -42,6 +42,10 @@ def plainly_contains(outer, inner):
         return False
     shape = ".*".join(map(re.escape, first.split("*")))
     return bool(re.fullmatch(shape, inner[0])) and plainly_contains(rest, inner[1:])
+
+
+def pattern_contains(outer, inner):
+    return container(outer)(contained(inner)) is not None
 
 
 @given(PATTERNS, PATTERNS)

@@ -6,7 +6,6 @@ spawned, never forked: a forked child would share its parent's session without t
 
 from __future__ import annotations
 
-import subprocess
 import sys
 import threading
 from typing import TYPE_CHECKING, Self
@@ -111,6 +110,8 @@ def actor_command(
 ) -> list[str]:
     """Return the command that runs an actor as a process of its own.
 
+    The process ends on SIGTERM after its current update; its log goes to standard error.
+
     Args:
         target: ``MODULE:CLASS``.
         cell: A `cell.toml` or an endpoint.
@@ -128,23 +129,3 @@ def actor_command(
         command += ["--option", f"{option}={value}"]
     command += ["--entity", entity] if entity else []
     return command
-
-
-def spawn_actor(
-    target: str,
-    *,
-    cell: str | Path,
-    name: str = "",
-    worlds: Mapping[str, str] | None = None,
-    options: Mapping[str, object] | None = None,
-    entity: str = "",
-) -> subprocess.Popen[bytes]:
-    """Start an actor as a process of its own; arguments as for `actor_command`.
-
-    The process ends on SIGTERM after its current update; its log goes to this process's standard
-    error.
-    """
-    return subprocess.Popen(
-        actor_command(target, cell=cell, name=name, worlds=worlds, options=options, entity=entity),
-        stdin=subprocess.DEVNULL,
-    )

@@ -51,7 +51,6 @@ DECISIONS_MAX: Final = 65_536
 WRITING: Final = ("change", "init", "delete")
 """What `write` stands for."""
 DATA_RIGHTS: Final = ("read", *WRITING)
-PATH_RIGHTS: Final = ("fork", "drop", "register", "keep")
 PLAIN_RIGHTS: Final = ("break", "resolve", "observe")
 """Rights on the cell as a whole: their path is `ALL`."""
 ALL: Final = "**"

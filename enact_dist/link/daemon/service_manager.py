@@ -57,10 +57,9 @@ class ServiceManager:
         if self._send(f"READY=1\n{_status_line(status)}MAINPID={os.getpid()}"):
             self._status = status
 
-    def stopping(self, status: str = "") -> None:
+    def stopping(self) -> None:
         """Report that this process was asked to end."""
-        if self._send(f"STOPPING=1\n{_status_line(status)}"):
-            self._status = status
+        self._send("STOPPING=1\n")
 
     def alive(self, status: str = "") -> None:
         """Ping for the calling thread, and send a changed status.

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
     from enact_dist.config.rights import SecurityConfig
 
-KEYS_VARIABLE: Final = "ENACT_KEYS"
 IDENTITY_VARIABLE: Final = "ENACT_IDENTITY"
 AUTHORITY: Final = "ca.pem"
 AUTHORITY_KEY: Final = "ca.key"

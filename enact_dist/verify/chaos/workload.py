@@ -110,11 +110,11 @@ class LockWorkload:
 
     # ---------------------------------------------------------------- plans
 
-    def _thing(self, shard: str, *, aspect: str = "") -> tuple[Any, Entity, Aspect[str]]:
+    def _thing(self, shard: str) -> tuple[Any, Entity, Aspect[str]]:
         draw = self._draw
         world = self._worlds[draw.choices(WORLDS, (3, 1))[0]]
         number = draw.choices(range(THINGS_PER_SHARD), range(THINGS_PER_SHARD, 0, -1))[0]
-        name = aspect or draw.choices(("kept", "swift", "frame"), (4, 2, 2))[0]
+        name = draw.choices(("kept", "swift", "frame"), (4, 2, 2))[0]
         return world, Entity(f"thing/{shard}/{number}"), ASPECTS[name]
 
     def plan(self) -> PlannedLock:

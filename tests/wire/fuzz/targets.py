@@ -19,7 +19,7 @@ import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
-from enact_dist.actor import report as actor_report
+from enact_dist.actor.report import read_reports
 from enact_dist.core.protocol.datum import Datum
 from enact_dist.errors import DatumTypeError, ProtocolError, StoreError
 from enact_dist.link.folder.blobs import Blob
@@ -32,6 +32,7 @@ from enact_dist.wire import keys
 from enact_dist.wire.codecs import register_codec
 from enact_dist.wire.frames import decode_frame, encode_frame
 from enact_dist.wire.payload import decode_datum, decode_untyped, encode_datum
+from enact_dist.world.listings import unpacked_report
 
 _LENGTH = struct.Struct("<I")
 ROWS_MAX = 100
@@ -193,7 +194,7 @@ def _is_text(raw: bytes) -> bool:
 def report(raw: bytes) -> object:
     """Read an actor's report out of a keep-alive; it is only shown, never written again."""
     try:
-        return actor_report.decode_reports(raw)
+        return read_reports(unpacked_report(raw))
     except ProtocolError:
         return None
 
