@@ -107,8 +107,8 @@ class ReplicatedFaults(FaultInjector):
     def _kinds(self) -> dict[str, Callable[[], bool]]:
         clients = list(self._cell.clients)
         kinds: dict[str, Callable[[], bool]] = {
-            KILL_SERVING: lambda: self._kill(KILL_SERVING, serves=True),
-            KILL_STANDBY: lambda: self._kill(KILL_STANDBY, serves=False),
+            KILL_SERVING: lambda: self._end_daemon(KILL_SERVING, serves=True, kills=True),
+            KILL_STANDBY: lambda: self._end_daemon(KILL_STANDBY, serves=False, kills=True),
             STOP_SERVING: lambda: self._stop_daemon(STOP_SERVING, serves=True),
             STOP_STANDBY: lambda: self._stop_daemon(STOP_STANDBY, serves=False),
             RESTART_SERVING: lambda: self._end_daemon(RESTART_SERVING, serves=True),
@@ -135,18 +135,6 @@ class ReplicatedFaults(FaultInjector):
         name = self._free([n for n, p in places.items() if p.up.is_set() and p.serves == serves])
         return None if name is None else places[name]
 
-    def _kill(self, kind: str, *, serves: bool) -> bool:
-        place = self._daemon(serves=serves)
-        if place is None or place.process is None:
-            return False
-        place.ordered = True
-        place.pause_s = self._draw.choice((0.0, AGAIN_S, 1.0, 2.0)) * self._lease_s
-        from_ns = time.monotonic_ns()
-        place.up.clear()
-        place.process.signal(signal.SIGKILL)
-        self._await_up(place, kind, from_ns)
-        return True
-
     def _await_up(self, place: DaemonPlace, kind: str, from_ns: int) -> None:
         """Note a fault once a daemon is up again."""
         self._busy.add(place.name)
@@ -163,14 +151,16 @@ class ReplicatedFaults(FaultInjector):
 
         self._after(0.0, look)
 
-    def _end_daemon(self, kind: str, *, serves: bool) -> bool:
+    def _end_daemon(self, kind: str, *, serves: bool, kills: bool = False) -> bool:
         place = self._daemon(serves=serves)
         if place is None or place.process is None:
             return False
         place.ordered = True
+        if kills:
+            place.pause_s = self._draw.choice((0.0, AGAIN_S, 1.0, 2.0)) * self._lease_s
         from_ns = time.monotonic_ns()
         place.up.clear()
-        place.process.signal(signal.SIGTERM)
+        place.process.signal(signal.SIGKILL if kills else signal.SIGTERM)
         self._await_up(place, kind, from_ns)
         return True
 
