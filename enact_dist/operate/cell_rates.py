@@ -182,7 +182,7 @@ class Looks:
 
     def _note_actors(self, look: Look) -> None:
         for info in look.actors:
-            for report in _reports(info):
+            for report in info.rows():
                 name = str(report["name"])
                 before = self._sessions.get(name)
                 if info.namesakes or info.silent or before == info.session:
@@ -200,7 +200,7 @@ class Looks:
             away_s = max(look.unix_s - self._away_unix_s[shard.name], 0.001)
             return ShardRates(shard.name, shard.endpoint, "AWAY", away_s, shard.problem)
         users = [info for info in look.actors if shard.name in info.shards]
-        reports = [report for info in users if not info.silent for report in _reports(info)]
+        reports = [report for info in users if not info.silent for report in info.rows()]
         locks = [lock for lock in look.locks if lock.shard == shard.name]
         count = shard.counters.get
 
@@ -263,7 +263,7 @@ class Looks:
 
     def _actors(self, infos: Iterable[ActorInfo], lost: str = "") -> Iterator[ActorRates]:
         for info in infos:
-            reports, state = _reports(info), lost or ("silent" if info.silent else "")
+            reports, state = info.rows(), lost or ("silent" if info.silent else "")
             session: dict[str, Any] = {
                 "host": info.host,
                 "pid": info.pid,
@@ -327,13 +327,6 @@ def _leases(left_s: Iterable[float]) -> dict[str, int]:
     for one in left_s:
         counts[LEASE_NAMES[sum(one >= bound_s for bound_s in LEASES_S)]] += 1
     return counts
-
-
-def _reports(info: ActorInfo) -> list[Mapping[str, Any]]:
-    """Return the reports of a session's actors; a client may send anything."""
-    rows = info.report.get("actors")
-    rows = rows if isinstance(rows, (list, tuple)) else ()
-    return [row for row in rows if isinstance(row, dict) and row.get("name")]
 
 
 def _number(report: Mapping[str, Any], name: str) -> float:

@@ -214,12 +214,15 @@ class ActorInfo:
         """Whether its lease is over, so that its last report no longer describes its state."""
         return self.lease_left_s < 0.0
 
+    def rows(self) -> list[dict[str, Any]]:
+        """Return the reports of its actors that have a name; a client may send anything."""
+        rows = self.report.get("actors")
+        rows = rows if isinstance(rows, (list, tuple)) else ()
+        return [row for row in rows if isinstance(row, dict) and row.get("name")]
+
     def names(self) -> frozenset[str]:
         """Return the names of the actors that run in this session, as they report it."""
-        reported = self.report.get("actors")
-        rows = reported if isinstance(reported, (list, tuple)) else ()
-        running = [row for row in rows if isinstance(row, dict) and row.get("state") in RUNNING]
-        return frozenset(str(row.get("name")) for row in running)
+        return frozenset(str(row["name"]) for row in self.rows() if row.get("state") in RUNNING)
 
 
 @dataclass(frozen=True, slots=True)

@@ -63,9 +63,9 @@ def reports_of(cell: Cell, name: str) -> list[tuple[ActorInfo, dict[str, Any]]]:
     return [
         (info, row)
         for info in cell.actors()
-        if not info.silent and isinstance(info.report.get("actors"), (list, tuple))
-        for row in info.report["actors"]
-        if isinstance(row, dict) and row.get("name") == name
+        if not info.silent
+        for row in info.rows()
+        if row["name"] == name
     ]
 
 
