@@ -74,6 +74,16 @@ def test_save_writes_arrays_as_npz_and_the_rest_as_json(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("value", "text"),
+    [(1 + 2j, "(1+2j)"), (np.datetime64("2026-11-29"), "2026-11-29"), (np.longdouble(1.5), "1.5")],
+)
+def test_save_writes_what_json_does_not_have_as_text(value, text, tmp_path):
+    """Complex numbers, dates and numbers of more than 64 bits, as `--json` prints them."""
+    showing.save(np.array([value]), str(tmp_path / "a.json"))
+    assert json.loads((tmp_path / "a.json").read_text()) == [text]
+
+
+@pytest.mark.parametrize(
     ("datum", "name", "reason"),
     [
         (3, "a.npz", "holds no array"),

@@ -329,6 +329,12 @@ def test_datum_that_does_not_fit_is_told_and_shown_as_json(kind):
     assert found["/json"]["value"] == "text"
 
 
+def test_extended_precision_is_shown_as_numbers():
+    """What no JSON number is becomes one, in whatever it stands; it ended the recording."""
+    message = shown({"a": np.array([1.5, np.inf], np.longdouble)})[""]
+    assert json.loads(json_bytes(message))["value"] == {"a": [1.5, "inf"]}
+
+
 def test_null_takes_a_mesh_away_and_empties_a_cloud():
     """What was deleted does not stand in the scene for ever."""
     gone = recorded("piece", None, null="DELETED")

@@ -156,7 +156,8 @@ def save(datum: object, name: str) -> str:
         np.save(path, datum, allow_pickle=False)
         return f"{path}: {_array_summary(datum)}"
     if path.suffix == ".json":
-        path.write_text(json.dumps(_whole(datum), ensure_ascii=False, indent=2), encoding="utf-8")
+        text = json.dumps(_whole(datum), default=str, ensure_ascii=False, indent=2)
+        path.write_text(text, encoding="utf-8")
         return f"{path}: {path.stat().st_size} bytes"
     raise ConfigError(f"{path}: the ending says how to save: .npz, .npy or .json")
 

@@ -339,6 +339,8 @@ def plain(value: object) -> object:
         return {"dtype": str(value.dtype), "shape": list(value.shape)}
     if isinstance(value, bytes):
         return {"bytes": len(value), "hex": value[:64].hex()}
+    if isinstance(value, np.longdouble):  # `tolist` leaves it as it is
+        return plain(float(value))
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     return value
