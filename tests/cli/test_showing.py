@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from enact_dist.cli.text import showing
-from enact_dist.errors import ConfigError
+from enact_dist.errors import ConfigError, StoreError
 
 DATUM = {
     "__type__": "Surface",
@@ -96,6 +96,14 @@ def test_save_is_refused_when_the_format_cannot_hold_it(datum, name, reason, tmp
     with pytest.raises(ConfigError, match=reason):
         showing.save(datum, str(tmp_path / name))
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("ending", [".npy", ".npz", ".json"])
+def test_a_disk_that_refuses_is_told_with_the_file(ending, tmp_path):
+    """What numpy says of a full disk is two numbers."""
+    path = tmp_path / "away" / f"a{ending}"
+    with pytest.raises(StoreError, match=f"cannot write {path}: No such file"):
+        showing.save(np.zeros(3), str(path))
 
 
 @pytest.mark.parametrize("hostile", ["\x1b[2J", "\x9b1m", "\r", "\u202e", "\x07"])

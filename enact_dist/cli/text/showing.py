@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from enact_dist.config.table import path_of
-from enact_dist.errors import ConfigError
+from enact_dist.errors import ConfigError, StoreError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -142,8 +143,17 @@ def save(datum: object, name: str) -> str:
 
     Raises:
         ConfigError: The ending is unknown, or the datum has nothing that the format can hold.
+        StoreError: The disk refuses; the file is not there, or not whole.
     """
     path = path_of(name)
+    try:
+        return _saved(datum, path)
+    except OSError as error:  # that of numpy names no file, and a full disk by two numbers
+        text = f"cannot write {path}: {error.strerror or error}"
+        raise StoreError(text, path=str(path)) from error
+
+
+def _saved(datum: object, path: Path) -> str:
     arrays: dict[str, Any] = {key or "datum": array for key, array in _arrays(datum, "")}
     if path.suffix == ".npz":
         if not arrays:
