@@ -210,7 +210,7 @@ def _recorded_line(summary: RecordingSummary) -> str:
 # ---------------------------------------------------------------- replay
 
 
-def run_replay(options: argparse.Namespace) -> Output | int:
+def run_replay(options: argparse.Namespace) -> Output:
     """Commit a recording again until its end or a signal; fail where nothing in it was chosen.
 
     Raises:

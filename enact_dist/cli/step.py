@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 from enact_dist.cli.actor.run import actor_entry, cell_file
 from enact_dist.cli.arguments import pairs, slot_version
 from enact_dist.cli.target import cell_config, open_cell, see_modules
-from enact_dist.cli.text.output import print_json
-from enact_dist.cli.verbs import DIFFERENT, DONE, FAILED
+from enact_dist.cli.verbs import DIFFERENT, DONE, FAILED, Output
 from enact_dist.cli.world.diff import print_diff
 from enact_dist.errors import ConfigError, MisuseError
 from enact_dist.terms import Aspect
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
     from enact_dist.actor.running.step import StepResult
 
 
-def run_step(options: argparse.Namespace) -> int:
+def run_step(options: argparse.Namespace) -> Output:
     """Run a step again; status 4 if it writes something else, 1 if it raises.
 
     Raises:
@@ -41,16 +40,18 @@ def run_step(options: argparse.Namespace) -> int:
             actor, worlds, keep_as=options.keep_as, tolerances=_tolerances(options, actor)
         )
         replaced = cell.invalidate(options.invalidate, step.made) if options.invalidate else ()
-    if options.json:
-        invalidated = [{**one.slot._asdict(), "version": one.version} for one in replaced]
-        print_json({**result.to_json(), "invalidated": invalidated})
-    else:
+    invalidated = [{**one.slot._asdict(), "version": one.version} for one in replaced]
+
+    def show() -> None:
         _print(result)
         for one in replaced:
             print(f"{one.slot} v{one.version} is null now")
-    if result.error:
-        return FAILED
-    return DIFFERENT if result.differs else DONE
+
+    return Output(
+        {**result.to_json(), "invalidated": invalidated},
+        show,
+        status=FAILED if result.error else DIFFERENT if result.differs else DONE,
+    )
 
 
 def _actor(options: argparse.Namespace) -> tuple[Actor, dict[str, str] | None]:

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 from enact_dist.cli.arguments import pairs
 from enact_dist.cli.shard.shard import refuse_shared, whole_store
 from enact_dist.cli.target import cell_config
-from enact_dist.cli.text.output import ProgressLine, print_json, print_table, shown_bytes
-from enact_dist.cli.verbs import DONE, FAILED
+from enact_dist.cli.text.output import ProgressLine, print_table, shown_bytes
+from enact_dist.cli.verbs import DONE, FAILED, Output
 from enact_dist.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from enact_dist.link.offline.forgetting import Purged
 
 
-def run_forget(options: argparse.Namespace) -> int:
+def run_forget(options: argparse.Namespace) -> Output:
     """Say what goes and let it go; it may be killed at any time and called again."""
     from enact_dist.link.offline.forgetting import forget, look
 
@@ -48,33 +48,36 @@ def run_forget(options: argparse.Namespace) -> int:
     if not folders and database is None:
         raise ConfigError(f"no shard of {config.path} has its data here: {'; '.join(elsewhere)}")
     told = _Told(as_json=options.json, goes="goes" if options.yes else "would go")
-    more: dict[str, Any] = {"unused": config.worlds if options.unused else None, "progress": told}
+    unused = config.worlds if options.unused else None
     try:
         if database is not None:
             from enact_dist.link.offline.database import forget_database
 
             found = forget_database(
                 database, options.aspects, only=options.shard, now_ns=time.time_ns(),
-                dry_run=not options.yes, **more,
+                unused=unused, dry_run=not options.yes, progress=told,
             )  # fmt: skip
         elif options.yes:
-            found = forget(folders, options.aspects, now_ns=time.time_ns(), **more)
+            found = forget(
+                folders, options.aspects, now_ns=time.time_ns(), unused=unused, progress=told
+            )
         else:
-            found = look(folders, options.aspects, **more)
+            found = look(folders, options.aspects, unused=unused, progress=told)
     finally:
         told.line.end()
-    if options.json:
-        print_json(_facts(found, elsewhere, done=options.yes))
-    elif options.yes and (found.going or found.resumed or found.worlds):
-        print(_end(found))
     for line in elsewhere:
         print(f"enact: {line}", file=sys.stderr)
-    if options.yes or options.dry_run or not (found.going or found.resumed or found.worlds):
-        return DONE
-    named = ["--unused"] if options.unused else found.aspects or found.done
-    words = _command(named, options.shard)
-    print(f"enact: nothing was changed; to let it go: {words}", file=sys.stderr)
-    return FAILED
+    goes = bool(found.going or found.resumed or found.worlds)
+    refused = goes and not (options.yes or options.dry_run)
+    if refused:
+        named = ["--unused"] if options.unused else found.aspects or found.done
+        words = _command(named, options.shard)
+        print(f"enact: nothing was changed; to let it go: {words}", file=sys.stderr)
+    return Output(
+        _facts(found, elsewhere, done=options.yes),
+        _end(found) if goes and options.yes else "",
+        status=FAILED if refused else DONE,
+    )
 
 
 def _command(aspects: Iterable[str], shards: Iterable[str] = ()) -> str:
