@@ -149,6 +149,23 @@ def test_close_from_the_failure_callback_does_not_hang(gated):
     thread.close()
 
 
+def test_an_interrupt_in_a_write_fails_the_store(gated, monkeypatch):
+    """It goes on to the thread that lent itself; nobody waits for records that are not stored."""
+
+    def interrupted(_):
+        raise KeyboardInterrupt
+
+    failures = []
+    monkeypatch.setattr(gated.store, "write", interrupted)
+    gated.gate.set()
+    thread = StoreThread(gated, pytest.fail, failures.append)
+    with pytest.raises(KeyboardInterrupt):
+        lent(thread, 1)
+    assert [type(failure) for failure in failures] == [KeyboardInterrupt]
+    thread.submit(persist(slot_record("a", 2), ticket=2))
+    thread.close()
+
+
 # ---------------------------------------------------------------- threads that lend themselves
 
 

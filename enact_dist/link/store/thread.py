@@ -47,7 +47,7 @@ class StoreThread:
         self,
         store: Store,
         done: Callable[[list[int]], None],
-        failed: Callable[[Exception], None],
+        failed: Callable[[BaseException], None],
     ) -> None:
         self._store = store
         self._takes_loans = store.holding is None  # a database may take its time
@@ -83,7 +83,7 @@ class StoreThread:
     def write_here(self) -> None:
         """Write and report what is queued, in the calling thread unless another one writes.
 
-        It takes as long as the disk does, and no Ctrl-C may come in between: not for the main
+        It takes as long as the disk does, and a Ctrl-C in between fails the store: not for the main
         thread.  Do not call it while holding a lock that `done` or `failed` takes.
         """
         if not self._takes_loans:
@@ -131,13 +131,15 @@ class StoreThread:
                 self._report([persist.ticket for persist in batch if persist.ticket])
             if rests and not self._broken:
                 self._store.rest()
-        except Exception as failure:  # noqa: BLE001 - whatever it was, nothing may be acknowledged
+        except BaseException as failure:  # whatever it was, nothing may be acknowledged
             with self._wake:
                 self._ending = self._broken = True
                 self.queue.clear()
                 self._wake.notify()
             self._pen.release()
             self._failed(failure)
+            if not isinstance(failure, Exception):
+                raise
         else:
             self._pen.release()
 
