@@ -361,7 +361,7 @@ class Once:
                             else:
                                 lock.put(request, value, stamp_ns=stamp_ns)
             except REFUSALS as error:
-                if self._stop.is_set():
+                if stopping := self._stop.is_set():
                     give_up_s = min(give_up_s, time.monotonic() + OUTCOME_S)
                 if time.monotonic() >= give_up_s:
                     log.error(  # noqa: TRY400 (the error is the shard's, and named)
@@ -371,8 +371,12 @@ class Once:
                     )  # fmt: skip
                     return False
                 log.warning("%s: outcome %s not written yet: %s", self._name, ended.state, error)
-                time.sleep(self._back_off.wait_s(refused, 0.0))
+                pause_s = min(self._back_off.wait_s(refused, 0.0), give_up_s - time.monotonic())
                 refused += 1
+                if stopping:
+                    time.sleep(max(0.0, pause_s))
+                elif self._stop.wait(pause_s):
+                    refused = 0  # at once, then as often as after a first refusal
             else:
                 if found not in (taken, ended):
                     log.error(

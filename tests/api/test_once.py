@@ -20,9 +20,11 @@ from once_robot import (
 
 from enact_dist import testing
 from enact_dist.access.lock import Lock
+from enact_dist.actor import once
 from enact_dist.actor.actor import Actor
 from enact_dist.actor.outcome import Outcome
 from enact_dist.actor.running.process import ActorThread
+from enact_dist.actor.triggers import BackOff
 from enact_dist.errors import MisuseError
 from enact_dist.terms import (
     Aspect,
@@ -280,3 +282,29 @@ def test_actor_that_is_stopped_while_it_waits_for_its_lock_just_ends(cell, onlin
         assert all(lock.granted for lock in cell.locks())
 
     assert read(online, OUTCOME) is None
+
+
+def test_outcome_that_waits_to_be_written_is_tried_at_once_when_the_actor_stops(
+    cell, online, caplog, monkeypatch
+):
+    """A stop request cuts the pause after a refusal short: what moved is told before the end."""
+    monkeypatch.setattr(once, "BackOff", lambda spread: BackOff(PATIENCE_S, PATIENCE_S, spread))
+    begun, ends = threading.Event(), threading.Event()
+
+    def moves(_):
+        begun.set()
+        assert ends.wait(PATIENCE_S)
+
+    robot = Robot(moves)
+    robot.wait_s = 0.2
+    write(online, PLAN, [1])
+    with ActorThread(robot, cell) as thread:
+        assert begun.wait(PATIENCE_S)
+        with Lock(Write(online, ROBOT, OUTCOME)):
+            ends.set()
+            while not any("outcome done not written yet" in line for line in caplog.messages):
+                pass
+        thread.stop()
+        thread.join(PATIENCE_S / 2)
+
+    assert read(online, OUTCOME).state == "done"
