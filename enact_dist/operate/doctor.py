@@ -341,4 +341,7 @@ def knock(endpoint: str, *, timeout_s: float = 2.0) -> tuple[str, str]:
         return str(error), f"look at the network: ping {host}"
     if is_locked(endpoint):
         return "something listens, but no connection comes about", "see the check of its key"
-    return "something listens, but it is no shard of this cell", f"see what runs at port {port}"
+    return (
+        "something listens: another program, or a shard that is stopped or hangs",
+        f"see what runs at port {port}; restart a shard that hangs",
+    )

@@ -103,10 +103,15 @@ def test_disk_that_stood_still_is_a_warning():
 
 
 def test_knock_tells_why_nobody_answers():
-    """A refused connection, an unknown host and a stranger are three different remedies."""
+    """A refused connection, an unknown host and a stranger are three different remedies.
+
+    A shard that is stopped takes connections, too: it was told as another program.
+    """
     with socket.create_server(("127.0.0.1", 0)) as stranger:
         port = stranger.getsockname()[1]
-        assert doctor.knock(f"tcp/127.0.0.1:{port}")[0].startswith("something listens")
+        why, remedy = doctor.knock(f"tcp/127.0.0.1:{port}")
+        assert why.endswith("another program, or a shard that is stopped or hangs")
+        assert remedy.endswith("restart a shard that hangs")
     assert doctor.knock(f"tcp/127.0.0.1:{port}")[0] == f"nothing listens at port {port}"
     assert (
         doctor.knock("tcp/no-such-host.invalid:7447")[0]
@@ -123,7 +128,7 @@ def test_each_endpoint_of_a_silent_shard_is_knocked_at():
         (found,) = doctor._shard(silent)
 
     assert (found.level, found.subject) == (Level.FAIL, "shard s0")
-    assert f"at {places[0]}, something listens, but it is no shard of this cell" in found.text
+    assert f"at {places[0]}, something listens: another program" in found.text
     assert f"at {places[1]}, nothing listens at port 9" in found.text
     assert f"at {places[2]}, nothing listens at port 7" in found.text
     assert found.remedy.count("start the shard") == 1
