@@ -47,8 +47,15 @@ def open_host(
     if place is None:
         store, recovered = None, Recovered(epoch=unkept_epoch(wall_ns))
     else:
-        from enact_dist.link.folder.folder import refuse_far_stamps, refuse_strangers
+        from enact_dist.link.folder.folder import (
+            holds_store,
+            refuse_far_stamps,
+            refuse_strangers,
+            warn_of_others,
+        )
 
+        if isinstance(place, Path) and not holds_store(place):
+            warn_of_others(place, settings.name, settings.placement)
         store, recovered, where = _opened(place, wall_ns // 1_000_000_000)
         with ExitStack() as undo:
             undo.callback(store.close)

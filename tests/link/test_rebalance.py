@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 from rebalance_cells import ENTITIES, LATE, POSE, StoppedCell, placement
-from store_writer import persist, slot_record
+from store_writer import fill, persist, slot_record
 
 from enact_dist.core.protocol.datum import LockId, Position, Token
 from enact_dist.core.protocol.messages import SlotVersion, WriteItem
@@ -19,11 +19,13 @@ from enact_dist.core.protocol.records import (
     SessionRecord,
     WorldRecord,
 )
+from enact_dist.core.shard.state import ShardSettings
 from enact_dist.errors import StoreError
 from enact_dist.link.folder.folder import refuse_strangers
 from enact_dist.link.folder.marks import moving_mark
 from enact_dist.link.offline import rebalance as module
 from enact_dist.link.offline.rebalance import look, rebalance
+from enact_dist.link.opening import open_host
 from enact_dist.link.store.store import open_store, read_store
 
 TWO = placement("left", "right")
@@ -310,3 +312,15 @@ def test_leases_of_before_the_stop_end_first(tmp_path, monkeypatch):
     assert slept_s == [found.waited_s]
     assert 600.0 - took_s <= found.waited_s <= 600.0
     assert [moving_mark(folder) for folder in folders.values()] == [None, None]
+
+
+def test_a_renamed_shard_starts_with_a_warning_that_names_its_old_folder(tmp_path, caplog):
+    """Once: its data seemed to be gone, and nothing said where they are."""
+    for name in ("left", "left.replaced-17", "main"):
+        fill(tmp_path / name, 1)
+    (tmp_path / "notes").mkdir()
+    for _ in range(2):
+        open_host(ShardSettings("right", TWO), tmp_path / "right").close()
+
+    (told,) = (line for line in caplog.messages if "does not name" in line)
+    assert told.endswith(f"enact shard rebalance --store main={tmp_path / 'main'}")

@@ -96,8 +96,7 @@ def _folders(config: CellConfig, stores: dict[str, str], new: list[str]) -> dict
 
 def _name_others(config: CellConfig, folders: dict[str, Path]) -> None:
     """Say where else entities lie: a shard that has left the cell must be named to be emptied."""
-    from enact_dist.link.folder.folder import holds_store
-    from enact_dist.link.offline.backup import ASIDE
+    from enact_dist.link.folder.folder import ASIDE, holds_store
     from enact_dist.link.store.store import read_store
 
     parent = config.data_folder

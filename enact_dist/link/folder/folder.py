@@ -6,6 +6,7 @@ failed check raises a `StoreError` that names the file and the remedy.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import shutil
 from pathlib import Path
@@ -25,6 +26,8 @@ LOG_FILE: Final = "store.db-wal"
 BLOB_FOLDER: Final = "blobs"
 ACCEPT_LOSS_FILE: Final = "accept-loss"
 """An operator creates it; the one start that it is meant for deletes it."""
+ASIDE: Final = ".replaced-"
+"""Follows the name of a folder that was put aside; the second in which that happened follows."""
 _REFUSED_SUFFIX: Final = ".refused"
 
 _RESTORE: Final = (
@@ -99,6 +102,23 @@ def refuse_far_stamps(folder: Path | str, stored: Recovered, *, wall_ns: int) ->
             holder,
             (stamp_ns - wall_ns) / 1e9,
         )
+
+
+def warn_of_others(folder: Path, shard: str, placement: PlacementMap) -> None:
+    """Warn of data beside a folder whose shard starts for the first time, as a renamed one does.
+
+    They are those of shards that the cell does not have; nothing else would say that they are lost.
+    """
+    names = {folder.name, *(entry.name for entry in placement.shards)}
+    with contextlib.suppress(OSError):
+        for path in sorted(folder.parent.iterdir()):
+            if path.name not in names and ASIDE not in path.name and holds_store(path):
+                _log.warning(
+                    "shard %s starts without data, and %s has data of a shard that cell.toml does"
+                    " not name: if that was renamed or has left the cell, stop the cell and move"
+                    " its entities: enact shard rebalance --store %s=%s",
+                    shard, path, path.name, path,
+                )  # fmt: skip
 
 
 def refuse(path: Path | str, found: str, remedy: str = "") -> NoReturn:

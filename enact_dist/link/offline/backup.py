@@ -30,6 +30,7 @@ from enact_dist.core.protocol.records import Recovered
 from enact_dist.errors import StoreError
 from enact_dist.link.folder.blobs import BlobFolder
 from enact_dist.link.folder.folder import (
+    ASIDE,
     BLOB_FOLDER,
     DATABASE_FILE,
     LOG_FILE,
@@ -66,8 +67,6 @@ from enact_dist.link.store.store import open_store, read_store
 DIGESTS: Final = "digests"
 TRIES_MAX: Final = 50
 """How often the files are copied again because the shard has restarted its log meanwhile."""
-ASIDE: Final = ".replaced-"
-"""Follows the name of a folder that was put aside; the second in which that happened follows."""
 
 
 @dataclass(frozen=True, slots=True)
