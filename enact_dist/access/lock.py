@@ -43,7 +43,6 @@ from enact_dist.wire.payload import encode_parts
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from types import TracebackType
 
     from enact_dist.access.session import Session
     from enact_dist.access.writes import DTypesLike, ShapesLike
@@ -74,6 +73,9 @@ def refuse_inside_lock(what: str) -> None:
     """
     held: Lock | None = getattr(_thread, "lock", None)
     if held is not None and held.running:
+        if held._is_abandoned():  # noqa: SLF001 - of this module
+            held.__exit__(KeyboardInterrupt, None, None)
+            return
         raise LockHeldError(
             f"{what} inside a lock would hold and wait; this thread holds {held!r};"
             " leave its block first"
@@ -185,12 +187,8 @@ class Lock(Triggered):
             return self._bound.items
         return tuple(map(self._session.item_of, self._requests))
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def _leave(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Leave the block: the work of `__exit__`, see `Leaves`."""
         lock, client = self._lock, self._session.client
         if lock is None or self._over:
             raise LockReleasedError(f"{self!r} is not held, so it cannot be left")

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Final
+from weakref import ref
 
 from enact_dist.errors import MisuseError
 from enact_dist.terms import Entity, View
@@ -110,8 +112,33 @@ class LockStatistics:
     fetched: int
 
 
+class Leaves:
+    """The `__exit__` of `Lock`, by which a lock knows whether its block runs.
+
+    A Ctrl-C that waits for the end of a long computation in C is raised where `__exit__` begins,
+    outside of any ``try`` in it.  Python does not call it again, but the ``with`` statement then
+    drops the object that it got from here.  The thread's next lock then ends the one left behind.
+    """
+
+    def __get__(self, lock: Any, owner: type[Any]) -> Callable[..., None]:
+        if lock is None:
+            leave: Callable[..., None] = owner._leave  # noqa: SLF001 - it is `Lock`
+            return leave
+        leaving = partial(owner._leave, lock)  # noqa: SLF001
+        if lock._lock is None and not lock._asking:  # noqa: SLF001 - it is not entered twice
+            lock._open = ref(leaving)  # noqa: SLF001
+        return leaving
+
+
 class Triggered:
-    """The part of `Lock` that an actor's runner fills in."""
+    """The part of `Lock` that an actor's runner fills in, and the end of its block."""
+
+    __exit__ = Leaves()
+    _open: ref[Any] | None = None
+
+    def _is_abandoned(self) -> bool:
+        """Whether the ``with`` statement has ended without `__exit__`; see `Leaves`."""
+        return self._open is not None and self._open() is None
 
     _entity: Entity | None = None
     _tick_ns = 0

@@ -1,6 +1,7 @@
 """Every way into and out of a lock leaves nothing behind: no grant, no flag, no lane."""
 
 import contextlib
+import ctypes
 import gc
 import signal
 import subprocess
@@ -189,6 +190,27 @@ def test_nothing_is_held_when_ctrl_c_strikes_before_the_commit(cell, online, mon
         held[count] = 1
         patch.setattr(lock.Writing, "by_shard", lambda *_: interrupt())
     assert online.view(View(online, bench, COUNT)).get(View(online, bench, COUNT)) is None
+    assert_nothing_left(cell, online)
+
+
+class Interrupts:
+    """As a long computation in C, during which Ctrl-C is pressed: `here[SIGINT]` is no call."""
+
+    __getitem__ = ctypes.PyDLL(None)["raise"]  # `signal.raise_signal` would handle it at once
+
+
+def test_ctrl_c_that_strikes_before_the_end_of_a_block_begins_leaves_the_thread_usable(
+    cell, online
+):
+    """The thread could never lock again: its lock ran on, and nobody would call `__exit__`."""
+    count, here = Write(online, bench, COUNT), Interrupts()
+    with pytest.raises(KeyboardInterrupt), Lock(count) as interrupted:
+        interrupted[count] = 1
+        here[signal.SIGINT]
+    assert interrupted.running
+    with Lock(count, wait_s=0) as granted:
+        assert granted.is_null(count)
+    assert not interrupted.running
     assert_nothing_left(cell, online)
 
 

@@ -24,7 +24,7 @@ FILES_MAX, CHANGES_MAX = 41, 101
 """What an update takes at present, rounded up; lower them whenever it takes less.  The aim is 24 files
 and 110 changes of file.
 """
-CALLS_MAX = 132
+CALLS_MAX = 133
 """Functions of the package that it calls, 417 once; the aim is 150."""
 UPDATES = 50
 
