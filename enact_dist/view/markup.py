@@ -6,6 +6,8 @@ import time
 from html import escape
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
 from enact_dist.cli.text.output import shown_bytes
 from enact_dist.cli.text.showing import lines, one_line, visible
 from enact_dist.world.trees import drawn, shown_s
@@ -119,10 +121,10 @@ def numbers_in(value: object, name: str = "") -> dict[str, float]:
     elif isinstance(value, list | tuple):
         for index, each in enumerate(value[:SERIES_MAX]):
             found |= numbers_in(each, f"{name}[{index}]")
-    elif hasattr(value, "ndim") and hasattr(value, "tolist"):
-        size_ = getattr(value, "size", 0)
-        if getattr(value, "ndim", 0) <= 1 and size_ <= SERIES_MAX:
-            found |= numbers_in(value.tolist(), name)
+    elif isinstance(value, np.longdouble):  # `tolist` leaves it as it is
+        found[name] = float(value)
+    elif isinstance(value, np.ndarray) and value.ndim <= 1 and value.size <= SERIES_MAX:
+        found |= numbers_in(value.tolist(), name)
     return dict(list(found.items())[:SERIES_MAX])
 
 

@@ -162,6 +162,9 @@ def test_each_actor_has_a_strip_of_its_own_run_times():
         ("text", {}),
         ({"x": 1, "note": "a", "in": {"y": [2, 3]}}, {"x": 1.0, "in.y[0]": 2.0, "in.y[1]": 3.0}),
         (np.array([1.0, 2.0]), {"[0]": 1.0, "[1]": 2.0}),
+        (np.array([1.5], np.longdouble), {"[0]": 1.5}),
+        (np.array(1.5, np.longdouble), {"": 1.5}),
+        (np.array([1.5], np.clongdouble), {}),
         (np.zeros((100, 3)), {}),
     ],
 )

@@ -458,6 +458,11 @@ def test_a_datum_without_a_shape_is_no_file(make):
         make(shown(1.5))
 
 
+def test_an_empty_image_is_no_file():
+    with pytest.raises(ConfigError, match=r"the image of .* is empty"):
+        png_of(shown(np.zeros((0, 3), np.uint8), "mask"))
+
+
 def test_a_label_stands_at_the_image_of_a_camera():
     """Its node is named as all others are."""
     image = shown(np.zeros((6, 8, 3), np.uint8), "image", entity="camera/1")

@@ -22,12 +22,14 @@ def png_of(shown: ShownDatum) -> bytes:
     """Return the image of a datum in its full size; floats are drawn, all others as they are.
 
     Raises:
-        ConfigError: The datum is shown as no image.
+        ConfigError: The datum is shown as no image, or the image is empty.
     """
     import imageio.v3 as imageio
 
     for drawable in shown.drawables.values():
         if isinstance(drawable, ShownImage):
+            if not drawable.pixels.size:
+                raise ConfigError(f"the image of {shown.recorded.slot} is empty")
             as_it_is = drawable.encoding in {"mono8", "rgb8", "rgba8", "16UC1"}
             pixels = drawable.pixels if as_it_is else rgb_of(drawable, max(drawable.shape))
             stream = BytesIO()
