@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import weakref
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from enact_dist.access.asking import await_stamp
 from enact_dist.access.reads import slot_of
@@ -112,6 +112,12 @@ class Session:
         self._looked_up: dict[AspectEntry, float] = {}
         self._lapses = 0
         self.unknown: set[AspectEntry] = set()
+
+    def __reduce__(self) -> NoReturn:
+        raise MisuseError(
+            "a cell cannot be pickled, and neither can contexts and requests made from it: let the"
+            " other process connect by itself, and send it names, entities and aspects"
+        )
 
     def prepare_bound(
         self, bound: BoundRequests, requests: Iterable[LockRequest[Any]], *, wait_s: float

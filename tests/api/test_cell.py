@@ -1,5 +1,6 @@
 """What a user of `Cell` may rely on: contexts, people's views of it, and its end."""
 
+import pickle
 import threading
 import time
 
@@ -141,6 +142,13 @@ def test_close_twice_is_harmless(cell):
     """A closed cell may be closed again."""
     cell.close()
     cell.close()
+
+
+def test_a_cell_and_what_was_made_from_it_are_not_pickled(cell, online):
+    """`multiprocessing` with "spawn" tries to, and named an object of the interpreter."""
+    for made in (cell, online, View(online, bench, COUNT)):
+        with pytest.raises(MisuseError, match="let the other process connect by itself"):
+            pickle.dumps(made)
 
 
 def test_two_cells_in_one_process_are_apart(cell, online):
