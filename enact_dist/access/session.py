@@ -306,11 +306,12 @@ class Session:
                 self._entries.clear()  # for programs that make a new aspect for each lock
                 self.bound.clear()  # so that the aspects of every set are entered again
             durability = aspect.durability.value if aspect.durability is not None else ""
+            try:
+                datum_type = fingerprint(aspect.datum_type)
+            except DatumTypeError as error:
+                raise DatumTypeError(f"aspect {aspect.name!r}: {error}") from None
             entry = AspectEntry(
-                aspect.name,
-                fingerprint(aspect.datum_type),
-                durability,
-                *said(checked_retention(aspect.retention)),
+                aspect.name, datum_type, durability, *said(checked_retention(aspect.retention))
             )
             known = (aspect, entry, entry._replace(reads=True))
             self._entries[id(aspect)] = known

@@ -13,6 +13,7 @@ error    unknown world        a world context that the cell does not list
 error    unknown aspect       an aspect that the cell does not list
 error    no such entity       the one `entity` of an actor does not match what it declares
 error    two types            one aspect name with two datum types
+error    impossible type      an aspect whose type no datum can have
 error    own trigger          an actor that, as bound, writes what triggers it
 error    two writers          two actors that write one slot, not both declaring it as `shared`
 error    rights stale         `rights.toml` differs from what the actors declare, or is missing
@@ -51,7 +52,7 @@ from enact_dist.config.table import suggestion
 from enact_dist.core.protocol.datum_types import newest, type_conflict
 from enact_dist.core.protocol.messages import AspectEntry
 from enact_dist.core.state.retention import limits_of, said, with_larger
-from enact_dist.errors import ConfigError, MisuseError
+from enact_dist.errors import ConfigError, DatumTypeError, MisuseError
 from enact_dist.retention import checked_retention
 from enact_dist.terms import Entity
 
@@ -285,8 +286,12 @@ def _types(uses: Sequence[Use]) -> Iterator[ActorFinding]:
     entries: list[tuple[Use, AspectEntry]] = []
     for use in uses:
         aspect, reads = use.request.aspect, not use.request.access.writes
-        entry = AspectEntry(aspect.name, fingerprint(aspect.datum_type), "", reads=reads)
-        entries.append((use, entry))
+        try:
+            entry = AspectEntry(aspect.name, fingerprint(aspect.datum_type), "", reads=reads)
+        except DatumTypeError as error:
+            yield ActorFinding("error", "impossible type", (use.actor.name,), f"{use}: {error}")
+        else:
+            entries.append((use, entry))
     for use, entry in sorted(entries, key=lambda each: each[1].reads):  # first those that write
         _, before = known.setdefault(entry.name, (use, entry))
         if not entry.reads and newest(before, entry) == entry:

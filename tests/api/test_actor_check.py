@@ -179,6 +179,23 @@ def test_check_finds_two_types_when_one_aspect_name_has_two():
     assert "int" in found.text
 
 
+def test_check_names_the_actor_and_aspect_of_a_type_that_no_datum_can_have():
+    """All other types are compared nevertheless; "set: set cannot be a datum" named none of it."""
+
+    class Tagging(Actor):
+        tags = Write(online, Entity("part"), Aspect("tags", set))
+        cloud = View(online, VIEWS, Aspect("cloud", int))
+        triggers = (cloud,)
+        update = idle
+
+    impossible, other = sorted(check(Camera, Tagging), key=lambda one: one.kind)
+
+    assert (impossible.level, impossible.kind, other.kind) == (
+        "error", "impossible type", "two types"
+    )  # fmt: skip
+    assert impossible.text.startswith("tagging1.tags (Write online/part tags): set: set cannot be")
+
+
 @dataclass(frozen=True)
 class Spot:
     x_mm: float

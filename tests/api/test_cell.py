@@ -11,6 +11,7 @@ import pytest
 from enact_dist import Aspect, Entity, Lock, Position, Read, View, Write, connect, local
 from enact_dist.errors import (
     ConfigError,
+    DatumTypeError,
     LockHeldError,
     MisuseError,
     ShardUnreachableError,
@@ -149,6 +150,12 @@ def test_a_cell_and_what_was_made_from_it_are_not_pickled(cell, online):
     for made in (cell, online, View(online, bench, COUNT)):
         with pytest.raises(MisuseError, match="let the other process connect by itself"):
             pickle.dumps(made)
+
+
+def test_a_type_that_no_datum_can_have_is_refused_with_the_name_of_the_aspect(online):
+    """A lock may have many."""
+    with pytest.raises(DatumTypeError, match="aspect 'tags': set: set cannot be a datum"):
+        Lock(Write(online, bench, COUNT), Write(online, bench, Aspect("tags", set))).__enter__()
 
 
 def test_two_cells_in_one_process_are_apart(cell, online):
