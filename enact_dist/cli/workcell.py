@@ -146,7 +146,7 @@ def _report_of(
     return report
 
 
-def _print_board(board: Board, options: argparse.Namespace) -> int:
+def _print_board(board: Board, options: argparse.Namespace) -> Output:
     from actors.geometry.cameras.board_sheet import KINDS, MARGIN_M, sheet
     from actors.geometry.files import check_output, write_whole
 
@@ -158,11 +158,11 @@ def _print_board(board: Board, options: argparse.Namespace) -> int:
     check_output(file.parent)
     write_whole({file: sheet(board, file.suffix.lower())})
     wide, high = (1e3 * (edge + 2.0 * MARGIN_M) for edge in (board.width_m, board.height_m))
-    print(
+    return Output(
+        {"path": str(file), "wide_mm": wide, "high_mm": high, "board": str(board)},
         f"{file}: {wide:g} x {high:g} mm; print it at 100 %, glue it to something flat, measure a"
-        f" square ({1e3 * board.square_m:g} mm), and say what you measured: --board {board}"
+        f" square ({1e3 * board.square_m:g} mm), and say what you measured: --board {board}",
     )
-    return DONE
 
 
 def _print(report: CalibrateReport) -> None:

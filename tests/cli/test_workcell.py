@@ -18,6 +18,9 @@ def test_a_board_is_written_to_print(enact, tmp_path):
         assert "212 x 284 mm; print it at 100 %" in result.out
         assert "--board 8x11,0.024,0.018,4X4_50" in result.out
 
+    told = enact("workcell", "calibrate", "--print-board", str(file), "--json").json
+    assert (told["path"], round(told["wide_mm"]), round(told["high_mm"])) == (str(file), 212, 284)
+
 
 @pytest.mark.parametrize(
     ("words", "status", "reason"),

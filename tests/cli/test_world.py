@@ -95,6 +95,15 @@ def test_get_saves_arrays(at, tmp_path):
     assert (np.load(tmp_path / "image.npy") == np.arange(30.0)).all()
 
 
+@pytest.mark.parametrize("verb", [("get", "online"), ("at", "online", "-0.001s", "get")])
+def test_get_that_saves_says_so_as_json(at, verb, tmp_path):
+    """A program that asked for JSON got a line for people."""
+    path = tmp_path / "image.npy"
+    saved = at(*verb, "camera/image", "--out", path, "--json").json
+
+    assert saved == {"path": str(path), "size_bytes": path.stat().st_size}
+
+
 def test_get_of_null_is_refused_with_its_reason(at):
     """A datum that is not known is an error that says why, status 1."""
     result = at("get", "online", "nobody/count")

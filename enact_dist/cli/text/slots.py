@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.cli.text.output import shown_bytes
 from enact_dist.cli.verbs import Output
-from enact_dist.config.table import suggestion
+from enact_dist.config.table import path_of, suggestion
 from enact_dist.errors import EnactError, NullDatumError
 from enact_dist.terms import NullReason
 from enact_dist.world.trees import Branch, print_tree, shown_s
@@ -58,7 +58,7 @@ def _slot_line(info: SlotInfo, at_ns: int | None) -> str:
     return f"v{info.version}{size}  {shown_s(max(0.0, age_s))} {'ago' if at_ns is None else 'old'}"
 
 
-def datum_output(datum: object, *, out: str | None) -> Output | int:
+def datum_output(datum: object, *, out: str | None) -> Output:
     """Return a datum to print, or save it to the file `out`.
 
     Raises:
@@ -67,8 +67,8 @@ def datum_output(datum: object, *, out: str | None) -> Output | int:
     from enact_dist.cli.text import showing
 
     if out:
-        print(showing.save(datum, out))
-        return 0
+        text = showing.save(datum, out)
+        return Output({"path": str(path_of(out)), "size_bytes": path_of(out).stat().st_size}, text)
     return Output(lambda: showing.plain(datum), lambda: print(*showing.lines(datum), sep="\n"))
 
 

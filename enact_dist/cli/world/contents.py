@@ -71,7 +71,7 @@ def show_tree(cell: Cell, options: argparse.Namespace) -> Output:
     return slots_output(options.world, infos)
 
 
-def get_datum(cell: Cell, options: argparse.Namespace) -> Output | int:
+def get_datum(cell: Cell, options: argparse.Namespace) -> Output:
     """Print or save one datum."""
     entity, aspect = options.slot
     world = cell.world(options.world)

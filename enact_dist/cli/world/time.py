@@ -81,7 +81,7 @@ def _facts(version: Version[Any]) -> dict[str, object]:
     }
 
 
-def show_past(options: argparse.Namespace) -> Output | int:
+def show_past(options: argparse.Namespace) -> Output:
     """Show a tree of a past world context, or one datum of it.
 
     Raises:
