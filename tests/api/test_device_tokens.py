@@ -1,10 +1,13 @@
 """Tokens as outside devices compare them: they grow when a shard gets a folder, or loses it."""
 
+import itertools
 import time
 
 from enact_dist import Aspect, Entity, Lock, Write, local
 from enact_dist.core.protocol.datum import Token
 from enact_dist.core.state.clock import device_token, unkept_epoch
+from enact_dist.link import opening
+from enact_dist.link.clock import SystemClock
 
 PLAN = Aspect("plan", int)
 
@@ -18,18 +21,27 @@ def token_of(*place):
                 lock[write] = number
                 ((_, *token),) = lock.token
                 found.append(token)
-    # Starts of a daemon are further apart.
-    second = int(time.time())
-    while int(time.time()) == second:
-        time.sleep(0.01)
     return found
 
 
-def test_token_grows_when_a_shard_gets_a_folder_and_when_it_loses_it(tmp_path):
+def test_token_grows_when_a_shard_gets_a_folder_and_when_it_loses_it(tmp_path, monkeypatch):
     """A device that has seen the newest pair refuses whoever still has one of before."""
+    ahead_s = itertools.count()
+
+    class Later(SystemClock):
+        """The clock of a start that is a second after the one before, as starts of a daemon are."""
+
+        def __init__(self):
+            self._ahead_ns = next(ahead_s) * 1_000_000_000
+
+        def wall_ns(self):
+            return time.time_ns() + self._ahead_ns
+
+    monkeypatch.setattr(opening, "SystemClock", Later)
     tokens = [*token_of(), *token_of(), *token_of(tmp_path), *token_of(tmp_path), *token_of()]
 
     assert tokens == sorted(tokens)
+    assert next(ahead_s) == 5, "each start had its own second"
 
 
 def test_pairs_of_both_kinds_are_ordered_by_the_second_of_the_start():

@@ -1,13 +1,13 @@
 """`lock.new`: arrays that are filled in place and committed without a copy."""
 
 import os
-import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from polling import until
 
 from enact_dist import Aspect, Durability, Entity, Lock, Read, View, Write
 from enact_dist.errors import DatumTypeError, LockReleasedError, MisuseError, ReadonlyError
@@ -70,10 +70,7 @@ def payloads():
 
 def come_down_to(count):
     """Wait until so many payloads are left: a shard lets go of the others after its answers."""
-    end_s = time.monotonic() + 30.0
-    while len(payloads()) > count:
-        assert time.monotonic() < end_s, payloads()
-        time.sleep(0.005)
+    until(lambda: len(payloads()) <= count, missed=payloads)
     return len(payloads()) == count
 
 

@@ -3,6 +3,7 @@
 import threading
 
 import pytest
+from polling import until
 
 from enact_dist import (
     Actor,
@@ -96,18 +97,8 @@ def test_sources_of_one_class_run_at_once():
     with local(worlds=["online"]) as cell:
         one, two = (only(Camera(both), f"camera/{number}") for number in range(2))
         with ActorThread(one, cell, name="camera-0"), ActorThread(two, cell, name="camera-1"):
-            wait_for(lambda: len(shown(cell, IMAGE)) == 2)
+            until(lambda: len(shown(cell, IMAGE)) == 2)
             both.abort()  # one of them may wait for the other, which has ended
-
-
-def wait_for(reached) -> None:
-    """Look again and again until `reached()`, for a minute at most."""
-    pause = threading.Event()
-    for _ in range(6000):
-        if reached():
-            return
-        pause.wait(0.01)
-    pytest.fail("not reached within a minute")
 
 
 def test_triggered_actor_sees_its_own_entity_alone():
@@ -134,7 +125,7 @@ def test_running_actor_is_woken_by_its_own_entity_alone():
         with ActorThread(worker, cell) as thread:
             for number in range(3):
                 testing.run_once(only(Camera(), f"camera/{number}"), cell)
-            wait_for(lambda: thread.statistics().updates == 1)
+            until(lambda: thread.statistics().updates == 1)
             assert shown(cell, MASK) == {"camera/1": -1}
 
 

@@ -6,6 +6,7 @@ from datetime import UTC, datetime, timedelta, timezone
 import numpy as np
 import pytest
 from counted import COUNT, delete, put, value_of
+from polling import until
 
 from enact_dist import (
     Aspect,
@@ -108,10 +109,9 @@ def test_large_data_of_the_past_are_those_of_then(online):
 
 def test_moments_are_written_as_dates_and_seconds_too(online):
     """A reading of a clock lies between two commits as it does in time."""
-    put(online, ARM, 1)
-    time.sleep(0.01)
+    first = put(online, ARM, 1)
+    until(lambda: time.time_ns() // 1000 > first.stamp_ns // 1000)  # a date has whole microseconds
     moment_s, moment = time.time(), datetime.now(UTC)
-    time.sleep(0.01)
     put(online, ARM, 2)
 
     for when in (moment_s, moment, moment.astimezone(timezone(timedelta(hours=5)))):

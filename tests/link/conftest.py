@@ -6,10 +6,10 @@ import socket
 import subprocess
 import sys
 import tempfile
-import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import polling
 import pytest
 from ports import free_endpoint
 
@@ -198,15 +198,7 @@ def carry(request):
 @pytest.fixture
 def until():
     """Ask again until what comes back is true; return it."""
-
-    def ask(question, *, limit_s=120.0):
-        deadline_s = time.monotonic() + limit_s
-        while not (found := question()):
-            assert time.monotonic() < deadline_s, "it never came true"
-            time.sleep(0.002)
-        return found
-
-    return ask
+    return polling.until
 
 
 @pytest.fixture

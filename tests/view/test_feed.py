@@ -4,7 +4,8 @@ import threading
 
 import numpy as np
 import pytest
-from view_samples import ARM, POSE, SHOWS, SLOT, SPEED, SPEED_SLOT, move, until
+from polling import until
+from view_samples import ARM, POSE, SHOWS, SLOT, SPEED, SPEED_SLOT, move
 
 from enact_dist import Aspect, Entity, Lock, Write
 from enact_dist.access.snapshot import HeldView

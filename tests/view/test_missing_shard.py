@@ -4,8 +4,8 @@ import subprocess
 import sys
 
 import pytest
+from polling import until
 from ports import free_port
-from view_samples import until
 
 from enact_dist import Aspect, Entity, connect
 from enact_dist.core.protocol.datum import Slot

@@ -4,8 +4,9 @@ import socket
 import time
 
 import pytest
+from polling import until
 from quiet_browser import QuietClient
-from view_samples import SHOWS, move, moved, shown, slot, until
+from view_samples import SHOWS, move, moved, shown, slot
 
 from enact_dist.cli.main import main
 from enact_dist.errors import ConfigError

@@ -4,8 +4,9 @@ import threading
 from pathlib import Path
 
 import pytest
+from polling import until
 from quiet_browser import QuietClient
-from view_samples import ARM, POSE, SHOWS, SPEED, moved, until
+from view_samples import ARM, POSE, SHOWS, SPEED, moved
 
 from enact_dist import Aspect, Entity, Lock, Read, Write
 from enact_dist.recording.recorder import Recorder

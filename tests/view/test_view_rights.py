@@ -5,8 +5,8 @@ import pytest
 pytest.importorskip("cryptography", reason="making keys needs the extra 'keys'")
 pytest.importorskip("viser", reason="pages need the extra 'view'")
 
+from polling import until
 from rights_cells import guarded_cell
-from view_samples import until
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
 from enact_dist.cli.main import main

@@ -1,7 +1,5 @@
 """Data for the tests of the view: versions without a cell, and what they write into one."""
 
-import threading
-
 import numpy as np
 
 from enact_dist import Aspect, Entity, Lock, Retention, Write
@@ -25,16 +23,6 @@ def moved(x_m):
     matrix = np.eye(4)
     matrix[0, 3] = x_m
     return matrix
-
-
-def until(is_right):
-    """Wait until something holds that other threads bring about."""
-    pause = threading.Event()
-    for _ in range(2000):
-        if is_right():
-            return
-        pause.wait(0.01)
-    raise AssertionError("nothing came of it within 20 s")
 
 
 def move(cell, x_m, world="online"):

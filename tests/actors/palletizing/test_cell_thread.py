@@ -1,6 +1,5 @@
 """Claims about the physical cell in a thread of its own."""
 
-import threading
 import time
 
 import numpy as np
@@ -50,9 +49,9 @@ def test_time_runs_no_faster_than_asked():
 def test_time_stands_still_in_a_block():
     """Between two cycles nothing changes, and the cell goes on afterwards."""
     with RunningCell(PhysicalCell([carton()], seed=1), speed=20.0) as running:
-        with running.stopped() as cell:
+        with running.stopped() as cell, RunningCell(PhysicalCell([], seed=1), speed=20.0) as beside:
             first = cell.time_s
-            threading.Event().wait(0.02)
+            beside.wait_cycles(5)
             second = cell.time_s
         running.wait_cycles(2)
 

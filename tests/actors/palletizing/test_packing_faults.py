@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import pytest
+from polling import until
 
 pytest.importorskip("open3d", exc_type=ImportError)
 pytest.importorskip("mujoco", exc_type=ImportError)
@@ -67,17 +68,21 @@ class Trial:
 
     def until(self, what: str, condition: Callable[[], T]) -> T:
         """Wait until a condition holds, and return what it found; a shard may be away meanwhile."""
-        deadline_s = time.monotonic() + LONG_S
-        while time.monotonic() < deadline_s:
+
+        def asked() -> T | None:
             self.processes.check()
             with contextlib.suppress(EnactError, IndexError):
-                if found := condition():
-                    print(f"{time.strftime('%X')} {what}: {found}")
-                    return found
-            time.sleep(0.01)
-        log = self.processes.config.with_name("cell.log").read_text()[-3000:]
-        doing = self.get(ROBOT, EXECUTION), self.get(SYSTEM, REQUEST), self.get(SYSTEM, RESULTS)
-        raise AssertionError(f"not within {LONG_S:.0f} s: {what}\n{doing}\n{log}")
+                return condition()
+            return None
+
+        def missed() -> str:
+            log = self.processes.config.with_name("cell.log").read_text()[-3000:]
+            doing = self.get(ROBOT, EXECUTION), self.get(SYSTEM, REQUEST), self.get(SYSTEM, RESULTS)
+            return f"not within {LONG_S:.0f} s: {what}\n{doing}\n{log}"
+
+        found = until(asked, limit_s=LONG_S, missed=missed)
+        print(f"{time.strftime('%X')} {what}: {found}")
+        return found
 
     def doing(self, *primitives: str) -> Execution:
         """Wait until the robot executes one of some primitives."""

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from polling import until
 
 from actors.palletizing import gripper as gripper_module
 from actors.palletizing import robot
@@ -128,13 +129,12 @@ class Trial:
 
     def until(self, entity, aspect, condition):
         """Wait until a datum satisfies a condition, and return it."""
-        deadline_s = time.monotonic() + BOUND_S
-        while time.monotonic() < deadline_s:
+
+        def asked():
             datum = self.get(entity, aspect)
-            if datum is not None and condition(datum):
-                return datum
-            time.sleep(0.005)
-        raise AssertionError(f"{entity} {aspect} stays {datum}")
+            return datum if datum is not None and condition(datum) else None
+
+        return until(asked, limit_s=BOUND_S, missed=lambda: f"{aspect} {self.get(entity, aspect)}")
 
     def ended(self, number=None):
         """Wait until a net is over; return its execution."""

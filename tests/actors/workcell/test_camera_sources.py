@@ -1,10 +1,12 @@
 """Sources of images: what they give, and what cannot work as one line each."""
 
+import contextlib
 import threading
 
 import cv2
 import numpy as np
 import pytest
+from polling import until
 
 from actors.workcell.camera import Camera, Capture
 from actors.workcell.cameras.sources import (
@@ -168,12 +170,12 @@ def test_driver_that_hangs_is_named_and_comes_back():
     with pytest.raises(CameraError, match="camera/2: its source still hangs"):
         capture.frame(2 * PERIOD_NS, 0.05)
     device.free.set()
-    for _ in range(200):
-        try:
-            image, exposed_ns = capture.frame(3 * PERIOD_NS, 5.0)
-            break
-        except CameraError:
-            device.closed.wait(0.01)
+
+    def taken():
+        with contextlib.suppress(CameraError):
+            return capture.frame(3 * PERIOD_NS, 5.0)
+
+    image, exposed_ns = until(taken)
     assert (image.shape, exposed_ns) == ((48, 64, 3), 3 * PERIOD_NS)
     capture.close()
     assert device.closed.is_set()

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import pytest
+from polling import until
 
 pytest.importorskip("cv2", exc_type=ImportError)
 pytest.importorskip("mcap", exc_type=ImportError)
@@ -50,8 +51,9 @@ LEAST_S = 8.0
 """How much of the scenario the truth of a run must cover to say anything."""
 SCALE = 0.5
 """Of the images: a busy machine has no time for eight whole ones, and their faults are the same."""
-EVERY_CAMERA = [words.camera_entity(number).name for number in range(words.CAMERA_COUNT)]
 LOOK_S = 0.05
+"""Between two looks at the cell, each of which takes some of the machine's time."""
+EVERY_CAMERA = [words.camera_entity(number).name for number in range(words.CAMERA_COUNT)]
 MOTION = tuple(set(RECORDED) - {"silhouette", "hull", "limbs", "prediction"})
 """What the truth of a run needs: to record masks and hulls, too, a busy machine has no time."""
 
@@ -86,16 +88,20 @@ class Trial:
 
     def until(self, what: str, condition: Callable[[], T]) -> T:
         """Wait until a condition holds, and return what it found; a shard may be away meanwhile."""
-        deadline_s = time.monotonic() + LONG_S
-        while time.monotonic() < deadline_s:
+
+        def asked() -> T | None:
             self.processes.check()
             with contextlib.suppress(EnactError, IndexError):
-                if found := condition():
-                    print(f"{time.strftime('%X')} {what}")
-                    return found
-            time.sleep(LOOK_S)
-        log = self.processes.config.with_name("cell.log").read_text()[-3000:]
-        raise AssertionError(f"not within {LONG_S:.0f} s: {what}\n{log}")
+                return condition()
+            return None
+
+        def missed() -> str:
+            log = self.processes.config.with_name("cell.log").read_text()[-3000:]
+            return f"not within {LONG_S:.0f} s: {what}\n{log}"
+
+        found = until(asked, limit_s=LONG_S, pause_s=LOOK_S, missed=missed)
+        print(f"{time.strftime('%X')} {what}")
+        return found
 
     def joints(self, since_ns: int) -> words.Joints | None:
         """Return the last 0.3 s of the arm; None as long as part of them is from before a time."""

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from actors.workcell.cameras import video
 from actors.workcell.cameras.sources import CameraError, source_of
 from actors.workcell.cameras.video import driver_ns
 from actors.workcell.simulation.room import cameras
@@ -14,7 +15,10 @@ CALIBRATION = cameras(0.1)[0]  # 64 x 48
 
 
 class Capture:
-    """A driver: `queue` waits in its buffers, further images come as time goes on."""
+    """A driver: `queue` waits in its buffers, further images come as time goes on.
+
+    What waits for one finds the clocks of the driver moved on, so no test has to wait.
+    """
 
     def __init__(self):
         self.size, self.rate, self.letters = (64, 48), 30.0, "YUYV"
@@ -23,6 +27,13 @@ class Capture:
         self.queue, self.damaged, self.taken = [], 0, []
         self.settings, self.released, self.opened_as = [], 0, []
         self.now_ms = 0.0
+        self.waited_ns = 0
+
+    def time_ns(self):
+        return time.time_ns() + self.waited_ns
+
+    def monotonic_ns(self):
+        return time.monotonic_ns() + self.waited_ns
 
     def __call__(self, place, backend=None):
         self.opened_as.append((place, backend))
@@ -53,8 +64,8 @@ class Capture:
         if self.queue:
             self.level, taken_ns = self.queue.pop(0)
         else:
-            time.sleep(0.005)  # a driver waits for the next image
-            self.level, taken_ns = 200, time.monotonic_ns()
+            self.waited_ns += 5_000_000  # a driver waits for the next image
+            self.level, taken_ns = 200, self.monotonic_ns()
         self.now_ms = 1234.5 if self.stands_still else taken_ns / 1e6 if self.stamped else 0.0
         self.taken.append(self.level)
         return True
@@ -73,6 +84,7 @@ class Capture:
 def driver(monkeypatch):
     made = Capture()
     monkeypatch.setattr(cv2, "VideoCapture", made)
+    monkeypatch.setattr(video, "time", made)
     return made
 
 
