@@ -45,12 +45,14 @@ class FakeStore:
 
     def __init__(self, failure=None):
         self.may_write = threading.Event()
+        self.begun = 0
         self.batches = []
         self.written = threading.Semaphore(0)
         self.failure = failure
         self.closed = False
 
     def write(self, batch):
+        self.begun += 1
         assert self.may_write.wait(60)
         if self.failure is not None:
             raise self.failure
@@ -170,7 +172,7 @@ def test_host_takes_what_has_arrived_before_it_lets_time_pass(start, make_peer):
     assert order == [Granted]
 
 
-def test_host_acknowledges_a_durable_commit_only_after_the_store(start, make_peer):
+def test_host_acknowledges_a_durable_commit_only_after_the_store(start, make_peer, until):
     """No answer leaves while the store still writes; it leaves when the store is done."""
     store = FakeStore()
     store.may_write.set()
@@ -181,12 +183,13 @@ def test_host_acknowledges_a_durable_commit_only_after_the_store(start, make_pee
     store.may_write.clear()
     answered = threading.Event()
     answers = []
-    commit = []
+    commit, before = [], store.begun
     peer.call = lambda _, message: commit.append(message)
     peer.commit(granted, "cup", b"x")
 
     host.submit(commit[0], lambda answer: (answers.append(answer), answered.set()))
-    early = answered.wait(0.05)
+    until(lambda: store.begun > before)
+    early = answered.is_set()
     store.may_write.set()
 
     assert not early

@@ -9,6 +9,7 @@ import pytest
 pytest.importorskip("cryptography", reason="making keys needs the extra 'keys'")
 
 import key_cells
+from polling import until
 
 from enact_dist import Aspect, Entity, Lock, Read, Write, connect
 from enact_dist.cli.main import main
@@ -145,7 +146,7 @@ def test_stranger_hears_and_says_nothing_with_a_key_of_its_own(cell):
     """No queryable, notice or token of another name counts (H1)."""
     heard = []
     with (
-        cell.running(),
+        cell.running() as shard,
         cell.running("right"),
         connect(cell.file, actor="ada") as victim,
         RawZenoh(cell.config, mode="client", keys=cell.files("ben")) as raw,
@@ -166,11 +167,13 @@ def test_stranger_hears_and_says_nothing_with_a_key_of_its_own(cell):
                 lock[count] = number
         for one in declared:
             one.undeclare()
-        time.sleep(0.3)
+        later = raw.session.liveliness().declare_token(token_key("locked", BEN, OTHER))
+        until(lambda: (OTHER, BEN) in shard._service.present)  # so it has heard of the ends, too
         with Lock(count) as lock:
             assert lock[count] == 19
         assert [one.session for one in victim.actors() if one.actor == "ada"] == [session]
         assert not [key for key in heard if "@notices" not in key]
+        later.undeclare()
 
 
 def test_client_has_the_name_of_its_key(cell):
@@ -253,9 +256,7 @@ def test_bar_ends_the_sessions_of_a_name_whatever_tokens_it_declares(cell, capsy
         with Lock(count) as lock:
             session = next(one.session for one in victim.actors() if one.actor == "ada")
             token = raw.session.liveliness().declare_token(token_key("locked", BEN, session))
-            end_s = time.monotonic() + 10.0
-            while (session, BEN) not in shard._service.present and time.monotonic() < end_s:
-                time.sleep(0.01)
+            until(lambda: (session, BEN) in shard._service.present)
             assert {identity for one, identity in shard._service.present if one == session} == {
                 BEN,
                 shard.host.owner_of(session),

@@ -12,10 +12,12 @@ import pytest
 pytest.importorskip("cryptography", reason="making keys needs the extra 'keys'")
 
 import key_cells
+from polling import until
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
 from enact_dist.cli.main import main
 from enact_dist.cli.shard.reload import catches_hangup, listening_process
+from enact_dist.link.daemon import reload
 from enact_dist.link.daemon.reload import Reload
 from enact_dist.link.zenoh.tls import look, own_certificate
 from enact_dist.operate.keys import Authority, make_authority
@@ -34,13 +36,6 @@ def shown_end_s(cell):
     """Return when the certificate ends that the shard shows; 0 while it shows none."""
     found = look(cell.shards["left"], cell.files("ada")).certificate
     return found.ends_s if found is not None else 0.0
-
-
-def until(condition, *, wait_s=10.0):
-    end_s = time.monotonic() + wait_s
-    while not condition():
-        assert time.monotonic() < end_s, "waited in vain"
-        time.sleep(0.02)
 
 
 def test_reload_under_updates_loses_none_and_takes_a_moment(cell):
@@ -64,15 +59,19 @@ def test_reload_under_updates_loses_none_and_takes_a_moment(cell):
                 pauses.append(time.monotonic() - last_s)
                 last_s = time.monotonic()
 
+        def go_on():
+            enough = len(pauses) + 20
+            until(lambda: len(pauses) >= enough)
+
         before = shown_end_s(cell)
         with Lock(held) as holding:
             updating = threading.Thread(target=update)
             updating.start()
             for _ in range(3):
-                time.sleep(0.3)
+                go_on()
                 cell.make("shard.left", seconds=5000)
                 assert shard.reload()
-            time.sleep(0.3)
+            go_on()
             stop.set()
             updating.join()
             holding[held] = 7
@@ -89,13 +88,13 @@ def test_reload_under_updates_loses_none_and_takes_a_moment(cell):
 def test_client_that_ends_during_a_reload_loses_its_locks(cell):
     """Its token does not come back, and no event reports that."""
     code = f"""
-import os, time
+import signal
 from enact_dist import Aspect, Entity, Lock, Write, connect
 cell = connect({str(cell.file)!r}, actor="ben")
 lock = Lock(Write(cell.world("online"), Entity("bench"), Aspect("count", int)))
 lock.__enter__()
 print("held", flush=True)
-time.sleep(60)
+signal.pause()
 """
     with cell.running() as shard:
         holder = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
@@ -139,19 +138,27 @@ def test_files_that_cannot_be_used_leave_the_old_ones(cell, caplog, tmp_path):
             lock[count] = 1
 
 
-def test_shard_takes_a_new_certificate_by_itself_near_the_end(tmp_path):
+def test_shard_takes_a_new_certificate_by_itself_near_the_end(tmp_path, monkeypatch):
     """Not before: a key that was copied half is no reason to drop one that is good."""
+    looks, is_due = [], Reload._is_due
+    monkeypatch.setattr(Reload, "_is_due", lambda now: looks.append(is_due(now)) or looks[-1])
+    monkeypatch.setattr(reload, "LOOK_S_MAX", 0.2)  # else 60 s for the certificate of two years
+
+    def look_on():
+        enough = len(looks) + 3  # of the first the file may be older, of the last the end missing
+        until(lambda: len(looks) >= enough)
+
     cell = key_cells.KeyCell(tmp_path)
     cell.make("shard.left", seconds=60, starts_s=-54.0)  # a tenth is 6 s (and what it starts early)
     with cell.running():
         before = shown_end_s(cell)
-        time.sleep(0.6)
+        look_on()
         assert shown_end_s(cell) == before  # there is no newer file
         cell.make("shard.left")
         until(lambda: shown_end_s(cell) > before)
         long = shown_end_s(cell)
         cell.make("shard.left", seconds=100)
-        time.sleep(0.6)
+        look_on()
         assert shown_end_s(cell) == long  # its own is good for two years
 
 

@@ -4,9 +4,9 @@ import os
 import signal
 import socket
 import threading
-import time
 
 import pytest
+from polling import until
 
 from enact_dist.core.protocol.datum import Slot
 from enact_dist.core.protocol.messages import Notice, Survey
@@ -160,8 +160,7 @@ def got_meanwhile(queue, act):
     found = []
     waiter = threading.Thread(target=lambda: found.append(queue.get(None)))
     waiter.start()
-    while not queue._polling:
-        time.sleep(0.001)
+    until(lambda: queue._polling)
     act()
     waiter.join(60)
     return found[0]

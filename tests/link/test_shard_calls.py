@@ -2,7 +2,6 @@
 
 import logging
 import threading
-import time
 
 import pytest
 
@@ -52,6 +51,19 @@ def calling():
         calls.close()
 
 
+@pytest.fixture
+def rounds(monkeypatch):
+    """Of each round of calls that is over: whether a shard has answered."""
+    over, note = [], shard_calls._Line._note_silence
+
+    def noted(line, *, answered):
+        note(line, answered=answered)
+        over.append(answered)
+
+    monkeypatch.setattr(shard_calls._Line, "_note_silence", noted)
+    return over
+
+
 def line_threads():
     return [thread for thread in threading.enumerate() if thread.name == "enact-calls"]
 
@@ -72,12 +84,11 @@ def test_call_is_answered_with_its_shard_and_request(daemon, calling, endpoint, 
     assert calls.answers[-1] == ("s1", finish, Finished(LOCK))
 
 
-def test_shard_that_comes_late_is_reached_on_the_same_way(daemon, calling, endpoint, until):
+def test_shard_that_comes_late_is_reached_on_the_same_way(daemon, calling, endpoint, until, rounds):
     """A shard that is away costs one thread, and nothing has to be started again."""
     calls = calling(s1=endpoint)
-    for _ in range(200):
-        calls.submit("s1", RESOLVE)
-        time.sleep(0.001)
+    until(lambda: len(rounds) >= 3 or calls.submit("s1", RESOLVE))
+    assert not any(rounds)
     assert not calls.answers
     assert len(line_threads()) == 1
 
@@ -129,28 +140,26 @@ def test_primary_that_comes_back_is_asked_by_whoever_waits_for_it(
     assert second.host.figures()["locks_held"] == 0
 
 
-def test_call_that_is_queued_is_not_queued_twice(calling, endpoint, monkeypatch):
+def test_call_that_is_queued_is_not_queued_twice(calling, endpoint, until, monkeypatch):
     """What the core asks again each second does not pile up behind a shard that hangs."""
     asked, go_on = [], threading.Event()
 
     def hang(line, calls):
         asked.append(calls)
-        go_on.wait(5)
+        assert go_on.wait(60)
         return []
 
     monkeypatch.setattr(shard_calls._Line, "_answers", hang)
     monkeypatch.setattr(shard_calls, "QUEUED_MAX", 3)
     calls = calling(s1=endpoint)
     calls.submit("s1", RESOLVE)
-    while not asked:
-        time.sleep(0.001)
+    until(lambda: asked)
     for _ in range(100):
         calls.submit("s1", RESOLVE)
     for number in range(10):
         calls.submit("s1", Resolve(LOCK, Token(1, number), "s0"))
     go_on.set()
-    while len(asked) < 2:
-        time.sleep(0.001)
+    until(lambda: len(asked) > 1)
 
     assert asked[0] == [RESOLVE]
     assert len(asked[1]) == 3
@@ -196,16 +205,14 @@ def test_way_that_could_not_be_opened_is_tried_again(
 
 
 def test_silence_is_told_once_and_so_is_its_end(
-    daemon, calling, endpoint, until, monkeypatch, caplog
+    daemon, calling, endpoint, until, rounds, monkeypatch, caplog
 ):
     """A log of hours says the same thing once, with what to do."""
     caplog.set_level(logging.INFO, "enact.link")
     monkeypatch.setattr(shard_calls, "SILENT_S", 0.0)
     calls = calling(s1=endpoint)
-    for _ in range(100):
-        calls.submit("s1", RESOLVE)
-        time.sleep(0.002)
-    until(lambda: "does not answer" in caplog.text)
+    until(lambda: len(rounds) >= 4 or calls.submit("s1", RESOLVE))
+    assert not any(rounds)
     assert caplog.text.count("does not answer") == 1
 
     daemon(endpoint, "s1")

@@ -5,7 +5,6 @@ import random
 import secrets
 import sys
 import threading
-import time
 from pathlib import Path
 
 import pytest
@@ -33,7 +32,7 @@ BY_HAND = {m.Break, m.ForceAbort}
 
 
 @pytest.fixture
-def raw(endpoint):
+def raw(endpoint, until):
     """A Zenoh session without any of our code: `ask(header, payload)` gives all its answers."""
     opened = []
 
@@ -41,8 +40,8 @@ def raw(endpoint):
         if not opened:
             opened.append(open_session(connect=(endpoint,), lease_s=30.0))
             ping, key = encode_frame(m.Ping())[0], request_key("cell", "s0", "ping", "fuzz")
-            while not [*opened[0].get(key, attachment=ping, timeout=1.0)]:
-                time.sleep(0.005)  # until the shard's queryable is known here
+            # The shard's queryable becomes known here some time after the connection.
+            until(lambda: [*opened[0].get(key, attachment=ping, timeout=1.0)])
         sent = [
             opened[0].get(
                 request_key("cell", "s0", verb(header, payload), "fuzz"),

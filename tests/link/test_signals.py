@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 
 import pytest
 
@@ -79,7 +78,7 @@ from enact_dist.link.signals import StopSignals
 
 def idle():
     while True:
-        time.sleep(0.0005)
+        time.sleep(0.0005)  # so that these threads run often
 
 for _ in range(8):
     threading.Thread(target=idle, daemon=True).start()
@@ -117,7 +116,7 @@ def test_forked_child_leaves_the_signals_of_its_parent_alone():
         child = os.fork()
         if child == 0:
             os.write(say, b".")
-            time.sleep(30)
+            signal.pause()
             os._exit(1)
         os.read(forked, 1)
         os.kill(child, signal.SIGTERM)

@@ -173,17 +173,17 @@ def test_calls_go_on_over_zenoh_when_the_socket_is_gone(daemon, endpoint):
         assert carrier_of(cell).transport_of("s0").startswith("zenoh")
 
 
-def test_open_connections_outlive_the_file(daemon, endpoint):
+def test_open_connections_outlive_the_file(daemon, endpoint, until):
     """A deleted file ends no call; only what has to connect anew takes the other way."""
     shard = daemon(endpoint)
-    with connect(endpoint) as cell:
+    with connect(endpoint) as cell, connect(endpoint) as other:
         request = add_one(cell)
         (shard._shared.path / "socket").unlink()
         before = carrier_of(cell).calls["socket"]
         with Lock(request) as lock:
             waiting = threading.Thread(target=lambda: add_one(cell))
             waiting.start()
-            time.sleep(0.05)
+            until(lambda: not all(one.granted for one in other.locks()))
             lock[request] = 10
         waiting.join()
         with Lock(request) as lock:
@@ -226,7 +226,7 @@ def test_late_answer_never_meets_the_next_call(daemon, carry, endpoint):
         assert isinstance(carrier.request("s0", ListLocks(), timeout_s=30), Locks)
         if sum(late) == 5:
             break
-    time.sleep(0.2)
+    assert carrier.request("s0", question, timeout_s=30) is not None  # after all late answers
 
     assert isinstance(carrier.request("s0", ListLocks(), timeout_s=30), Locks)
     assert (sum(late), carrier.calls["zenoh"]) == (5, before)
@@ -252,7 +252,7 @@ def test_calls_beyond_the_connections_of_a_client_take_zenoh(daemon, carry, endp
 
 
 @pytest.mark.timing
-def test_waiting_threads_do_not_slow_a_fast_one(daemon, endpoint):
+def test_waiting_threads_do_not_slow_a_fast_one(daemon, endpoint, until):
     """Eight threads in long polls: the ninth is as fast as alone, each has its own connection."""
     daemon(endpoint)
     with connect(endpoint) as cell, connect(endpoint) as other:
@@ -280,8 +280,7 @@ def test_waiting_threads_do_not_slow_a_fast_one(daemon, endpoint):
         threads += [threading.Thread(target=lambda: add_one(cell)) for _ in range(8)]
         for thread in threads[1:]:
             thread.start()
-        while sum(not lock.granted for lock in other.locks()) < 8:
-            time.sleep(0.002)
+        until(lambda: sum(not lock.granted for lock in other.locks()) == 8)
         beside_s = [median_s() for _ in range(3)]
         release.set()
         for thread in threads:

@@ -3,7 +3,6 @@
 import os
 import socket
 import threading
-import time
 
 import pytest
 from socket_parts import COUNT, CUP, add_one, counters
@@ -133,12 +132,15 @@ def test_living_holder_keeps_its_lock_whatever_happens_to_its_sockets(
     shard = daemon(endpoint)
     process = program(HOLDER, endpoint, "socket", act)
     assert process.stdout.readline() == "held\n", process.stderr.read()
-    time.sleep(1.0)
+    later = program(HOLDER.replace("cup", "bowl"), endpoint, "socket", "pass")
+    assert later.stdout.readline() == "held\n", later.stderr.read()
+    later.kill()
+    until(lambda: counters(shard).get("sessions_died"))  # so a death of before is known, too
 
     output, errors = process.communicate("\n", timeout=60)
 
     assert output == "done\n", errors
-    assert "sessions_died" not in counters(shard)
+    assert counters(shard)["sessions_died"] == 1
     with connect(endpoint) as cell:
         request = Write(cell.world("online"), CUP, COUNT)
         with Lock(request) as lock:

@@ -52,13 +52,17 @@ def test_answer_that_another_thread_brings_at_once_is_sent_once(raw, monkeypatch
     """The connection's thread looks for its answer while another one is sending it."""
     near = raw()
     stream = Stream(near)
-    sending, submit, threads = threading.Event(), raw.shard.host.submit, []
-    send_what_fits = socket_connection.SocketConnection._send_what_fits
+    sending, looked = threading.Event(), threading.Event()
+    submit, threads, connection_of = raw.shard.host.submit, [], socket_connection.SocketConnection
+    send_what_fits = connection_of._send_what_fits
 
     def slowly(connection, answer):
         sending.set()
-        time.sleep(0.1)  # as if the kernel had let the other thread run
+        assert looked.wait(30)  # as if the kernel had let the other thread run
         return send_what_fits(connection, answer)
+
+    def noted(act):
+        return lambda *arguments: (looked.set(), act(*arguments))
 
     def brought_by_another(message, reply, identity, subject=None, lends=False):
         answers = queue.SimpleQueue()
@@ -68,11 +72,14 @@ def test_answer_that_another_thread_brings_at_once_is_sent_once(raw, monkeypatch
         threads[-1].start()
         assert sending.wait(30)
 
-    monkeypatch.setattr(socket_connection.SocketConnection, "_send_what_fits", slowly)
+    monkeypatch.setattr(connection_of, "_send_what_fits", slowly)
+    for name in ("_send", "_send_late"):  # whichever it comes to
+        monkeypatch.setattr(connection_of, name, noted(getattr(connection_of, name)))
     monkeypatch.setattr(raw.shard.host, "submit", brought_by_another)
     first = ask(near, AwaitStamp(0, 0), stream)
-    sending.clear()
     threads[0].join()
+    sending.clear()
+    looked.clear()
     second = ask(near, ListLocks(), stream)
 
     assert (type(first), type(second)) == (Reached, Locks)
@@ -204,7 +211,7 @@ def test_kernel_that_watches_no_more_processes_costs_nobody_a_connection(raw, mo
     assert service._deaths._session_of == {}
 
 
-def test_request_that_was_read_is_handled_before_the_tick(raw, monkeypatch):
+def test_request_that_was_read_is_handled_before_the_tick(raw, monkeypatch, until):
     """What a thread has taken from its socket and not handed in yet has arrived, too."""
     service, host = raw.shard._sockets, raw.shard.host
     decoding, go_on, decode = threading.Event(), threading.Event(), decode_frame
@@ -215,13 +222,20 @@ def test_request_that_was_read_is_handled_before_the_tick(raw, monkeypatch):
         return decode(*frame)
 
     monkeypatch.setattr(socket_connection, "decode_request", decode_slowly)
-    monkeypatch.setattr(socket_service, "DRAIN_ROUNDS", 5000)
+    monkeypatch.setattr(socket_service, "DRAIN_ROUNDS", 100_000)
+    rounds, wait = [], service._closing.wait
+
+    def noted(limit_s):
+        rounds.append(threading.current_thread())
+        return wait(limit_s)
+
+    monkeypatch.setattr(service._closing, "wait", noted)
     send_frame(raw(), encode_frame(ListLocks())[0])
     assert decoding.wait(30)
     handed_in, found = host._handles, []
     drain = threading.Thread(target=lambda: (service.drain_inbox(), found.append(host._handles)))
     drain.start()
-    time.sleep(0.02)  # an empty drain would be over
+    until(lambda: drain in rounds or not drain.is_alive())  # an empty drain would be over
     go_on.set()
     drain.join()
 

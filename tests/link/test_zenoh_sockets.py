@@ -9,11 +9,11 @@ import signal
 import socket
 import struct
 import threading
-import time
 from types import SimpleNamespace
 
 import pytest
 import zenoh
+from polling import until
 
 from enact_dist.link.zenoh import config as zenoh_config
 from enact_dist.link.zenoh import links as zenoh_links
@@ -103,10 +103,8 @@ def test_connections_of_sessions_are_settled_on_either_side(endpoint):
     clients = [open_session(connect=[endpoint], lease_s=lease_s) for lease_s in (2.0, 60.0)]
     expected = [750, 750, 3_000, 3_000]  # a client is as patient as a busy shard may need
     try:
-        deadline_s = time.monotonic() + 30.0
-        while settled(port) != expected:
-            assert time.monotonic() < deadline_s, f"{settled(port)} in place of {expected}"
-            time.sleep(0.005)  # nothing tells when a thread has seen a connection
+        # No event reports that a thread has seen a connection.
+        until(lambda: settled(port) == expected, missed=lambda: (settled(port), expected))
     finally:
         for session in (*clients, shard):
             close_session(session)
@@ -316,10 +314,7 @@ def test_lost_connection_is_looked_after_though_others_cannot_be_settled(watchin
     for event in link_events("+-", FAR):
         tell(event)
 
-    until = time.monotonic() + 30.0
-    while looks.qsize() < 2:
-        assert time.monotonic() < until, "nobody looks"
-        time.sleep(0.005)  # nothing tells of a look that did not fail
+    until(lambda: looks.qsize() > 1)
     assert looks.get() == {(FAR, 1)}
 
 
@@ -397,10 +392,7 @@ def test_looks_for_a_lost_connection_come_more_and_more_rarely(watching, monkeyp
     for tell in [watching([f"tcp/{FAR}:1"]) for _ in range(20)]:
         for event in link_events("+-", FAR):
             tell(event)
-    until = time.monotonic() + 30.0
-    while clock[0] <= 1_100.0:
-        assert time.monotonic() < until, looks
-        time.sleep(0.005)  # the clock of the thread is made up
+    until(lambda: clock[0] > 1_100.0, missed=lambda: looks)
 
     assert 40 < len(looks) < 200, len(looks)
     assert looks[-1][0] - looks[-2][0] == pytest.approx(2.0)
