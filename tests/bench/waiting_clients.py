@@ -84,7 +84,7 @@ def cpu_s(pids: list[int]) -> float:
 def cores(pids: list[int], seconds_s: float) -> float:
     """Return how many cores processes use for so long."""
     before_s, began_s = cpu_s(pids), time.monotonic()
-    time.sleep(seconds_s)
+    time.sleep(seconds_s)  # the time over which it is measured
     return (cpu_s(pids) - before_s) / (time.monotonic() - began_s)
 
 
@@ -138,7 +138,6 @@ def started(cell: CellProcesses, arguments: argparse.Namespace) -> list[LineProc
         words = [str(number), each, *(["--idle"] if arguments.idle else [])]
         clients.append(cell.start_client(Path(__file__).stem, "--client", *words))
         clients[-1].expect("ready:")
-    time.sleep(LOST_S)
     return clients
 
 
@@ -150,6 +149,7 @@ def measure(folder: Path, arguments: argparse.Namespace) -> dict[str, object]:
     with CellProcesses(folder, ("left", "right"), pins=pins, ttl_s=2.0) as cell:
         clients = started(cell, arguments)
         pids = [one.pid for one in clients]
+        cores(pids, LOST_S)  # what the start costs counts for nothing
         before, before_by = shares(pids, 10.0)
         for shard in cell.shards.values():
             shard.signal(signal.SIGSTOP)

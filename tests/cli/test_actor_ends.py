@@ -4,8 +4,8 @@ import contextlib
 import re
 import signal
 import subprocess
-import time
 
+import polling
 import pytest
 
 HUNG = """\
@@ -101,13 +101,11 @@ def module(tmp_path):
 
 def listed(enact, cell_file, mark):
     """Return the row of `actor ls` that has a mark, once there is one."""
-    end_s = time.monotonic() + PATIENCE_S
-    while True:
-        rows = enact("actor", "ls", "--cell", cell_file).out.splitlines()
-        found = [row for row in rows if mark in row]
-        if found:
-            return found[0]
-        assert time.monotonic() < end_s, rows
+
+    def rows():
+        return enact("actor", "ls", "--cell", cell_file).out.splitlines()
+
+    return polling.until(lambda: next((row for row in rows() if mark in row), ""), missed=rows)
 
 
 def test_update_that_hangs_is_stuck_and_ends_with_its_process(

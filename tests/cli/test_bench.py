@@ -6,10 +6,10 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
+from polling import until
 
 from enact_dist.bench import command
 from enact_dist.bench.place import Place
@@ -272,10 +272,7 @@ def test_bench_that_is_told_to_leave_removes_its_files(tmp_path):
         env={**os.environ, "TMPDIR": str(tmp_path)},
     )
     try:
-        deadline_s = time.monotonic() + 120
-        while not list(tmp_path.glob("enact-bench-*")):
-            assert time.monotonic() < deadline_s
-            time.sleep(0.01)
+        until(lambda: list(tmp_path.glob("enact-bench-*")))
         running.terminate()
 
         assert running.wait(120) == 1
@@ -304,21 +301,17 @@ def test_daemons_of_a_killed_bench_end(tmp_path):
         env={**os.environ, "TMPDIR": str(tmp_path)},
     )
     try:
-        deadline_s = time.monotonic() + 60
-        while not processes_of(tmp_path, b"enact_dist.bench.worker"):  # its shard serves
-            assert time.monotonic() < deadline_s
-            time.sleep(0.01)
+        until(lambda: processes_of(tmp_path, b"enact_dist.bench.worker"))  # its shard serves
         assert processes_of(tmp_path, b"shard")
     finally:
         running.kill()
         running.wait()
 
-    while left := processes_of(tmp_path, b"shard"):
-        if time.monotonic() > deadline_s + 60:
-            for pid in left:
-                os.kill(pid, signal.SIGKILL)
-            pytest.fail(f"daemons {left} run still")
-        time.sleep(0.05)
+    try:
+        until(lambda: not processes_of(tmp_path, b"shard"))
+    finally:
+        for pid in processes_of(tmp_path, b"shard"):
+            os.kill(pid, signal.SIGKILL)
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from enact_dist.operate import supervise
 
 COUNT = Aspect("count", int)
 ACTOR = """\
-import time
+import threading
 from enact_dist import Actor, Aspect, Entity, World, Write
 
 class Beat(Actor):
@@ -31,7 +31,7 @@ class Beat(Actor):
 class Hang(Beat):
     def update(self, lock):
         print("hangs", flush=True)
-        time.sleep(60)
+        threading.Event().wait()
 """
 
 

@@ -129,10 +129,10 @@ def test_killed_child_is_started_again_by_name_of_the_signal():
 
 def test_actor_that_is_done_is_not_started_again():
     """An actor that ends with status 0 has finished; the shards go on."""
-    story = Story("shard: beat", times=3, after="once: done")
-    beat = "import time; print('ready:')\nwhile True: print('beat'); time.sleep(0.3)"
+    story = Story("again: exit status 5", times=3, after="once: done")
+    again = task("again", "actor", "raise SystemExit(5)")  # is started again twice meanwhile
 
-    story.run(task("shard", "shard", beat), task("once", "actor", "print('worked')"))
+    story.run(task("shard", "shard", SERVE), task("once", "actor", "print('worked')"), again)
 
     assert story.lines.count("once: worked") == 1
     assert "once: done; it is not started again" in story.lines
