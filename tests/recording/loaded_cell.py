@@ -39,7 +39,7 @@ def main():
             commit(requests, number)
             if number == 1:
                 print("committing", flush=True)
-            time.sleep(pause_s)
+            time.sleep(pause_s)  # how much load there is
 
 
 if __name__ == "__main__":

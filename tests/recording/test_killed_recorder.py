@@ -6,12 +6,14 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
 from mcap.exceptions import McapError
 from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
+from polling import until
 from ports import free_endpoint
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
@@ -59,6 +61,11 @@ def endpoint(tmp_path, started):
     return address
 
 
+def has_begun(recorder, path):
+    """Whether a recorder has written its first commits, or has ended."""
+    return recorder.poll() is not None or (path.exists() and path.stat().st_size > 5_000)
+
+
 @pytest.mark.slow
 def test_killed_recorder_leaves_whole_commits_without_a_hole(endpoint, started, tmp_path):
     """Commits are whole, follow each other, and end at most a chunk before the kill."""
@@ -72,9 +79,8 @@ def test_killed_recorder_leaves_whole_commits_without_a_hole(endpoint, started, 
             "-m", "enact_dist.cli.main", "record", endpoint, "--out", path, "--world", "online",
             ready="",
         )  # fmt: skip
-        while not (path.exists() and path.stat().st_size > 5_000):
-            assert recorder.poll() is None, recorder.stdout.read()
-            time.sleep(0.01)
+        until(partial(has_begun, recorder, path))
+        assert recorder.poll() is None, recorder.stdout.read()
         time.sleep(seeds.uniform(0.0, 1.3))  # at any moment of a chunk
         recorder.send_signal(signal.SIGKILL)
         killed_ns = time.time_ns()

@@ -177,6 +177,7 @@ def test_images_without_a_time_of_the_driver_are_not_those_of_its_queue(driver):
 
     assert level(source, tick_ns) == 200
     assert source.exposed_ns >= tick_ns
+    assert driver.taken == [10, 11, 12, 13, 200]
 
 
 def test_a_driver_whose_time_stands_still_has_none(driver):
