@@ -89,7 +89,7 @@ class TcpProxy:
         try:
             while data := source.recv(CHUNK_BYTES):
                 if self._bytes_per_s:
-                    time.sleep(len(data) / self._bytes_per_s)
+                    time.sleep(len(data) / self._bytes_per_s)  # what the network takes for it
                 if (end := self._cut_after) is not None and self.passed + len(data) >= end:
                     self._cut_after = None
                     sink.sendall(data[: max(0, end - self.passed)])

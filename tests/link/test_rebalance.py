@@ -299,12 +299,12 @@ def test_leases_of_before_the_stop_end_first(tmp_path, monkeypatch):
     folders = two_stores(tmp_path, left=[HERE, SessionRecord("ann", 600_000_000_000)])
     slept_s = []
 
-    def sleep(wait_s):
+    def slept(wait_s):
         slept_s.append(wait_s)
         for folder in folders.values():
             assert moving_mark(folder) is not None
 
-    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=time.monotonic, sleep=sleep))
+    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=time.monotonic, sleep=slept))
     started_s = time.monotonic()
     found = rebalance(folders, placement("left", "right", pins=[("**", "right")]), unix_s=1)
     took_s = time.monotonic() - started_s

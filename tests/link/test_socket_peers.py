@@ -131,8 +131,8 @@ def test_living_holder_keeps_its_lock_whatever_happens_to_its_sockets(
     """Neither the end of a forked child nor closed connections prove a death."""
     shard = daemon(endpoint)
     process = program(HOLDER, endpoint, "socket", act)
-    assert process.stdout.readline() == "held\n", process.stderr.read()
     later = program(HOLDER.replace("cup", "bowl"), endpoint, "socket", "pass")
+    assert process.stdout.readline() == "held\n", process.stderr.read()
     assert later.stdout.readline() == "held\n", later.stderr.read()
     later.kill()
     until(lambda: counters(shard).get("sessions_died"))  # so a death of before is known, too

@@ -9,6 +9,7 @@ import time
 import production_line as line
 import pytest
 from network_site import LONG_S, SHARDS, TTL_S
+from polling import until
 
 from enact_dist import local
 from enact_dist.actor.running.process import ActorThread, actor_command
@@ -208,6 +209,7 @@ def test_network_does_what_it_is_told(whole, fault):
         whole.lay(Cable(loss=0.05))
     work(1, whole.near)
 
-    until_s = time.monotonic() + LONG_S
-    while not all(now > then for now, then in zip(counted(), before, strict=True)):
-        assert time.monotonic() < until_s, (before, counted())
+    until(
+        lambda: all(now > then for now, then in zip(counted(), before, strict=True)),
+        missed=lambda: (before, counted()),
+    )

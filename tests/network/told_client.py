@@ -115,7 +115,7 @@ class Probe(threading.Thread):
             with self._news:
                 self._reached_ns = self._journal.now_ns()
                 self._news.notify_all()
-            time.sleep(PROBE_S)
+            time.sleep(PROBE_S)  # how exactly the moment of a success is known
 
     def first_ns(self, since_ns):
         """Wait for a success after `since_ns` and return its time."""

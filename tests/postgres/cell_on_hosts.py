@@ -2,8 +2,8 @@
 
 import os
 import sys
-import time
 
+from polling import until
 from postgres_nodes import USER
 from replicated_cell import SHARD
 
@@ -75,10 +75,7 @@ class CellOnHosts:
 
     def await_log(self, host, text, within_s=60):
         """Return once a daemon has said this."""
-        end_s = time.monotonic() + within_s
-        while text not in self.log(host):
-            assert time.monotonic() < end_s, self.log(host)
-            time.sleep(0.05)  # a file tells of no new lines
+        until(lambda: text in self.log(host), limit_s=within_s, missed=lambda: self.log(host))
 
     def close(self):
         """End all processes and hosts; what a database leaves is its own."""

@@ -19,6 +19,7 @@ from pathlib import Path
 import postgres_nodes
 import psycopg
 from cell_on_hosts import CLIENTS, CellOnHosts, await_updates
+from polling import until
 
 from enact_dist.link.log import READY, STANDS_BY
 
@@ -45,15 +46,15 @@ class ManagedSite(CellOnHosts):
             with (self._data / MONITOR / "postgresql.conf").open("a") as file:
                 file.write(SHORT.read_text())
         self._manage(MONITOR, "run")
-        await_true(lambda: self.states() == {}, "the monitor answers")
+        until(lambda: self.states() == {}, pause_s=0.2)
         place = f"{self.hosts.address(MONITOR)}:{PORT}"
         monitor = f"postgres://autoctl_node@{place}/pg_auto_failover?sslmode=prefer"
         for host, state in zip(NODES, ("single", "secondary"), strict=True):
             self._manage(host, "create", "postgres", "--name", host, "--dbname", "cell", "--monitor", monitor)  # fmt: skip
             self._open_to_all(host)
             self._manage(host, "run")
-            await_true(lambda host=host, state=state: self.states().get(host) == state, state)
-        await_true(lambda: self.states().get(NODES[0]) == "primary", "primary")
+            until(lambda host=host, state=state: self.states().get(host) == state, pause_s=0.2)
+        until(lambda: self.states().get(NODES[0]) == "primary", pause_s=0.2)
         self.store_at(NODES, PORT, "cell")
 
     def _manage(self, host, *words):
@@ -112,14 +113,6 @@ class ManagedSite(CellOnHosts):
         for server in self._servers:
             server.wait()
         shutil.rmtree(self._data)
-
-
-def await_true(condition, what, within_s=120.0):
-    end_s = time.monotonic() + within_s
-    while not condition():
-        if time.monotonic() > end_s:
-            raise SystemExit(f"not within {within_s:g} s: {what}")
-        time.sleep(0.2)
 
 
 def measure(site, options):

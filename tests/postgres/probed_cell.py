@@ -1,15 +1,14 @@
 """A replicated cell whose daemons serve probes."""
 
 import os
-import time
 import urllib.error
 import urllib.request
 
+from polling import until
 from ports import free_port
 from replicated_cell import SHARD, ReplicatedCell
 
 from enact_dist.config.environment import variable_of
-from enact_dist.link.daemon.metrics import SEES_S
 
 DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 
@@ -42,14 +41,12 @@ class ProbedCell(ReplicatedCell):
 
     def shows(self, place, name, condition):
         """Wait until a metric has a value."""
-        end_s = time.monotonic() + 20.0
-        while not condition(found := value(self.ask(place, "/metrics")[1], name)):
-            assert time.monotonic() < end_s, (name, found)
-            time.sleep(0.05)
+
+        def found():
+            return value(self.ask(place, "/metrics")[1], name)
+
+        until(lambda: condition(found()), missed=lambda: (name, found()))
 
     def becomes(self, place, path, status):
         """Wait until a probe answers with a status."""
-        end_s = time.monotonic() + SEES_S + 20.0
-        while self.ask(place, path)[0] != status:
-            assert time.monotonic() < end_s, (place, path, self.ask(place, path))
-            time.sleep(0.05)
+        until(lambda: self.ask(place, path)[0] == status, missed=lambda: self.ask(place, path))

@@ -3,6 +3,7 @@
 import threading
 import time
 
+from polling import until
 from ports import free_endpoint
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
@@ -99,12 +100,12 @@ class Counting:
 
     def await_after(self, moment_s, timeout_s=20.0):
         """Return how long after a moment the next update was acknowledged."""
-        end_s = time.monotonic() + timeout_s
-        while True:
-            if later := [done_s for done_s in self.done_s[-200:] if done_s > moment_s]:
-                return later[0] - moment_s
-            assert time.monotonic() < end_s, f"no update for {timeout_s} s: {self.errors[-3:]}"
-            time.sleep(0.01)
+        later = until(
+            lambda: [done_s for done_s in self.done_s[-200:] if done_s > moment_s],
+            limit_s=timeout_s,
+            missed=lambda: f"no update for {timeout_s} s: {self.errors[-3:]}",
+        )
+        return later[0] - moment_s
 
     def next_update(self, timeout_s):
         """Return after how long the next update was acknowledged, but for the one under way."""

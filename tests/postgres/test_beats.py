@@ -3,6 +3,7 @@
 import threading
 import time
 
+from polling import until
 from shard_stores import address_of
 
 from enact_dist.core.failover.lease import OUTAGE_NS
@@ -49,19 +50,13 @@ def test_a_look_that_the_database_kept_waiting_counts_for_nothing(server, stores
 
     standby = threading.Thread(target=stand_by)
     standby.start()
-    _await(lambda: len(looks) > 3)
+    until(lambda: len(looks) > 3)
     medium._renewer.close()
     server.pause()
-    time.sleep(1.5)  # longer than the lease and what a standby waits
+    standby.join(1.5)  # longer than the lease and what a standby waits
+    assert not found
     server.go_on()
     back_s = time.monotonic()
     standby.join(20)
     assert found[0].seen.holder
     assert found[1] - back_s > OUTAGE_NS / 2e9  # the lease itself was over in a fifth of that
-
-
-def _await(condition):
-    end_s = time.monotonic() + 20
-    while not condition():
-        assert time.monotonic() < end_s
-        time.sleep(0.02)

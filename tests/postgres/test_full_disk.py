@@ -5,6 +5,7 @@ import time
 import psycopg
 import pytest
 import small_disk
+from polling import until
 from probed_cell import ProbedCell
 from replicated_cell import Counting
 
@@ -21,13 +22,6 @@ def full():
     if missing := small_disk.why_missing():
         pytest.skip(missing)
     return small_disk.small_server
-
-
-def until(condition, what):
-    end_s = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < end_s, what
-        time.sleep(0.05)
 
 
 def use_up(node):
@@ -59,16 +53,16 @@ def test_a_full_disk_loses_nothing_and_is_named(full, holds, tmp_path, shard_nam
             cell.shows(0, "enact_store_stalled_s", lambda stalled_s: stalled_s > 1.0)
             said = "cannot be reached" if holds == "wal" else "No space left on device"
             assert said in cell.log(0).read_text()
-            until(lambda: "commits and new clients wait" in cell.log(0).read_text(), "no word")
+            until(lambda: "commits and new clients wait" in cell.log(0).read_text())
             if holds == "wal":
                 assert main(["doctor", "--cell", str(cell.file)]) == 1
                 assert "FAIL  store:" in capsys.readouterr().out
-                until(lambda: "PANIC" in node.log(), node.log)
+                until(lambda: "PANIC" in node.log(), missed=node.log)
             else:  # what needs no writing goes on
                 assert main(["world", "get", "online", SLOT, "--cell", str(cell.file)]) == 0
             disk.make_room()
             if holds == "wal":
-                until(lambda: not (node.data / "postmaster.pid").exists(), "it never stopped")
+                until(lambda: not (node.data / "postmaster.pid").exists())
                 node.start()
             room_s = time.monotonic()
             for client in counting:

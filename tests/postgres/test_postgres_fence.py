@@ -8,6 +8,7 @@ from contextlib import closing
 
 import psycopg
 import pytest
+from polling import until
 from postgres_nodes import await_sync
 from shard_stores import address_of, state, take, versions
 from tcp_proxy import TcpProxy
@@ -243,11 +244,6 @@ def await_locked(node):
 
 
 def _await(node, condition):
-    end_s = time.monotonic() + 15
+    asked = f"SELECT pid FROM pg_stat_activity WHERE {condition}"
     with psycopg.connect(node.url, autocommit=True) as connection:
-        while True:
-            found = connection.execute(f"SELECT pid FROM pg_stat_activity WHERE {condition}")
-            if pids := [pid for (pid,) in found]:
-                return pids
-            assert time.monotonic() < end_s, condition
-            time.sleep(0.02)
+        return until(lambda: [pid for (pid,) in connection.execute(asked)])

@@ -1,13 +1,13 @@
 """What a standby serves that read ahead is what a fresh read gives, whatever went on meanwhile."""
 
 import threading
-import time
 from contextlib import closing, contextmanager
 from dataclasses import fields, replace
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from polling import until
 from shard_stores import address_of, state, take, versions
 from store_model import State
 from test_store_ledger import BATCHES, at_work
@@ -155,10 +155,7 @@ def _await_sweeps(server, address):
     """Wait until a standby has read rows and asks for newer ones."""
     statement = "SELECT 1 FROM pg_stat_activity WHERE query LIKE %s AND application_name = %s"
     values = ("%AND batch >%", ahead.connector_of(address)._rest["application_name"])
-    end_s = time.monotonic() + 20
-    while not server.execute(statement, values):
-        assert time.monotonic() < end_s
-        time.sleep(0.02)
+    until(lambda: server.execute(statement, values))
 
 
 def test_rows_that_only_a_lost_primary_had_are_read_again(server, stores):

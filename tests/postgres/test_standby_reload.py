@@ -3,9 +3,9 @@
 import json
 import os
 import signal
-import time
 
 import pytest
+from polling import until
 
 pytest.importorskip("cryptography", reason="making keys needs the extra 'keys'")
 
@@ -49,10 +49,8 @@ class GuardedCell(ReplicatedCell):
         return found is not None and found.ends_s == newest.ends_s
 
     def await_log(self, place, text, *, count=1):
-        end_s = time.monotonic() + 30
-        while self.log(place).read_text().count(text) < count:
-            assert time.monotonic() < end_s, self.log(place).read_text()
-            time.sleep(0.05)  # a file tells of no new lines
+        read = self.log(place).read_text
+        until(lambda: read().count(text) >= count, missed=read)
 
     def write(self):
         """Write as `writer`, who may or may not."""

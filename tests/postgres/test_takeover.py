@@ -6,6 +6,7 @@ import time
 from contextlib import ExitStack
 
 import pytest
+from polling import until
 from postgres_nodes import await_sync
 from replicated_cell import SHARD, Counting, ReplicatedCell
 from tcp_proxy import TcpProxy
@@ -148,10 +149,7 @@ def test_a_takeover_waits_for_the_databases_standby(cell, pair, clients):
 
 
 def await_line(cell, place, text):
-    deadline_s = time.monotonic() + 30
-    while text not in cell.log(place).read_text():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.1)  # a file tells of no new lines
+    until(lambda: text in cell.log(place).read_text(), missed=cell.log(place).read_text)
 
 
 def test_a_daemon_that_is_cut_off_from_its_database_is_replaced(cell, pair, clients):
