@@ -14,13 +14,13 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "deploy"))
 
 import kept  # noqa: E402
+from polling import until  # noqa: E402
 
 PREFIX = "enact-engine-"
 POOL = "base=198.18.64.0/18,size=24"
@@ -178,12 +178,20 @@ def wait_until_it_answers(engine: Engine, process: subprocess.Popen[bytes]) -> N
     Raises:
         NoEngineError: It ended, or never answered; with the end of its log.
     """
-    until_s = time.monotonic() + START_S
-    while engine.docker("version", check=False, wait_s=START_S).returncode:
-        if process.poll() is not None or time.monotonic() > until_s:
-            said = (engine.folder / "dockerd.log").read_text("utf-8").strip().splitlines()
-            raise NoEngineError("\n".join(said[-3:]) or "dockerd said nothing")
-        time.sleep(0.05)
+
+    def answers() -> bool:
+        if process.poll() is not None:
+            raise NoEngineError(last_words())
+        return not engine.docker("version", check=False, wait_s=START_S).returncode
+
+    def last_words() -> str:
+        said = (engine.folder / "dockerd.log").read_text("utf-8").strip().splitlines()
+        return "\n".join(said[-3:]) or "dockerd said nothing"
+
+    try:
+        until(answers, limit_s=START_S, pause_s=0.05, missed=last_words)
+    except AssertionError as error:
+        raise NoEngineError(str(error)) from None
 
 
 def claim(folder: Path) -> None:

@@ -2,12 +2,12 @@
 
 import json
 import sys
-import time
 from pathlib import Path
 
 sys.path.append(str(Path(__file__).parents[1] / "actors" / "palletizing"))
 
 import list_cell
+import polling
 
 PACKAGES = 4
 WAIT_S = 180.0
@@ -96,13 +96,9 @@ class Stack:
         return int(self.docker("wait", service).split()[-1])
 
 
-def until(found, missed, *, within_s=WAIT_S):
-    """Return what `found` returns as soon as that is something."""
-    end_s = time.monotonic() + within_s
-    while not (value := found()):
-        assert time.monotonic() < end_s, f"not within {within_s:.0f} s: {missed()}"
-        time.sleep(0.1)
-    return value
+def until(found, missed):
+    """Return what `found` returns as soon as that is something: an engine takes its time."""
+    return polling.until(found, limit_s=WAIT_S, pause_s=0.1, missed=missed)
 
 
 def cell_file(folder):

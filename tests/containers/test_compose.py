@@ -49,7 +49,7 @@ READ = """read = Read(*slot)
         ways = {shard.carrier.split()[0] for shard in cell.shards()}
         if ways == {"socket"}:
             break
-        time.sleep(0.25)
+        time.sleep(0.25)  # no event reports a way
     print(largest, "mapped" if mapped else "sent", "over", *ways)"""
 """A shard that stood still for half a second has its socket tried again, a few seconds later."""
 FAR = READ.replace("range(400)", "range(1)")

@@ -42,7 +42,7 @@ def count(shard, entity):
             mine["read"].append(value)
             mine["done_s"].append(time.time())
             Path("/tmp", shard).write_text(str(value))
-            time.sleep(0.02)
+            time.sleep(0.02)  # the load
     with Lock(write, wait_s=120.0) as lock:
         mine["last"] = lock[write]
 

@@ -16,7 +16,6 @@ import subprocess
 import sys
 import tarfile
 import tempfile
-import time
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -95,7 +94,8 @@ def record(file, recording, cell):
     while process.poll() is None:
         with Lock(write) as lock:
             lock[write] += 1
-        time.sleep(0.1)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(0.1)
     ended(process)
 
 

@@ -10,11 +10,11 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from polling import until
 
 from enact_dist.cli.main import main
 from enact_dist.errors import LinkError
@@ -138,10 +138,8 @@ def test_nobody_is_left_when_the_run_is_broken_off(tmp_path, number, status):
         run.send_signal(number)
 
         assert run.wait(END_S) == status
-    deadline_s = time.monotonic() + END_S
-    while processes_of(kept) and time.monotonic() < deadline_s:
-        time.sleep(0.05)  # nothing tells when a process of somebody else has ended
-    assert processes_of(kept) == []
+    # No event reports that the process of another parent has ended.
+    until(lambda: not processes_of(kept), limit_s=END_S, missed=lambda: processes_of(kept))
 
 
 def test_history_is_checked_again_from_its_folder(folder, capsys):

@@ -8,6 +8,7 @@ import time
 
 import pytest
 from accounts import COUNT, LEFT, RIGHT, open_accounts, two_shards
+from polling import until
 
 from enact_dist import Lock, Write, connect
 from enact_dist.errors import LeaseLostError
@@ -46,13 +47,6 @@ def finished(joined):
     return sum(shard.counters.get("commits_finished", 0) for shard in joined.shards())
 
 
-def until(question, found):
-    """Ask again until what comes back is true: others hear of an end after who has ended."""
-    deadline_s = time.monotonic() + 60.0
-    while not question():
-        assert time.monotonic() < deadline_s, found()
-
-
 @pytest.mark.carrier("socket", "zenoh")
 def test_transfers_between_shards_keep_the_sum_when_shards_are_killed(cell):
     """4 processes move numbers between two shards that are killed: no view sees another sum."""
@@ -78,8 +72,9 @@ def test_transfers_between_shards_keep_the_sum_when_shards_are_killed(cell):
     assert total(cell) == TOTAL
     assert seen["sums"] == [TOTAL], seen
     with connect(cell.file) as joined:
-        until(lambda: all(lock.state == "kept" for lock in joined.locks()), joined.locks)
-        until(lambda: finished(joined), joined.shards)
+        # Others hear of an end after the client that has ended.
+        until(lambda: all(lock.state == "kept" for lock in joined.locks()), missed=joined.locks)
+        until(lambda: finished(joined), missed=joined.shards)
 
 
 def test_lock_in_doubt_is_told_and_given_up_by_hand(cell):

@@ -4,10 +4,10 @@ Each client publishes images and reads each of them back whole, see `ahead_worke
 """
 
 import signal
-import time
 from pathlib import Path
 
 import pytest
+from polling import until
 from test_payloads import namespace
 
 from enact_dist import connect
@@ -31,13 +31,6 @@ def figures(cell):
     with connect(cell.file) as joined:
         (shard,) = joined.shards()
         return shard.counters
-
-
-def until(question, limit_s=30.0):
-    deadline_s = time.monotonic() + limit_s
-    while not question():
-        assert time.monotonic() < deadline_s, "it never came true"
-        time.sleep(0.05)
 
 
 def none_is_left(cell, root, versions):

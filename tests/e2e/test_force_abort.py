@@ -3,10 +3,10 @@
 import json
 import shutil
 import threading
-import time
 
 import pytest
 from accounts import COUNT, LEFT, RIGHT, open_accounts, start_trapped, two_trapped_shards
+from polling import until
 
 from enact_dist import Lock, View, Write, connect
 from enact_dist.errors import CommitUnknownError
@@ -69,14 +69,6 @@ def audited(cell):
     return [(entry["shard"], entry["kind"]) for entry in json.loads(
         cell.enact("lock", "audit", "--json", "--timeout", ANSWER_S).stdout
     )]  # fmt: skip
-
-
-def until(question, limit_s=180.0):
-    """Ask again until what comes back is true; return it."""
-    deadline_s = time.monotonic() + limit_s
-    while not (found := question()):
-        assert time.monotonic() < deadline_s, "it never came true"
-    return found
 
 
 def test_lock_in_doubt_is_shown_given_up_and_audited(cell, monkeypatch):

@@ -10,6 +10,7 @@ import pytest
 
 pytest.importorskip("cryptography", reason="making keys needs the extra 'keys'")
 
+from polling import until
 from ports import free_port
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
@@ -111,10 +112,9 @@ class Updates:
 
     def go_on(self):
         """Return once there are further updates."""
-        before, until_s = len(self.times), time.monotonic() + 60
-        while len(self.times) < before + 3:
-            assert time.monotonic() < until_s, f"{self.actor} has stopped at {self.acknowledged}"
-            time.sleep(0.02)
+        enough = len(self.times) + 3
+        stopped = lambda: f"{self.actor} has stopped at {self.acknowledged}"  # noqa: E731
+        until(lambda: len(self.times) >= enough, limit_s=60.0, missed=stopped)
 
     def longest_s(self, since):
         """Return the longest time between two updates after the first `since`."""
