@@ -301,14 +301,15 @@ def test_daemons_of_a_killed_bench_end(tmp_path):
         env={**os.environ, "TMPDIR": str(tmp_path)},
     )
     try:
-        until(lambda: processes_of(tmp_path, b"enact_dist.bench.worker"))  # its shard serves
+        # There is a worker once its shard serves.
+        until(lambda: processes_of(tmp_path, b"enact_dist.bench.worker"), pause_s=0.05)
         assert processes_of(tmp_path, b"shard")
     finally:
         running.kill()
         running.wait()
 
     try:
-        until(lambda: not processes_of(tmp_path, b"shard"))
+        until(lambda: not processes_of(tmp_path, b"shard"), pause_s=0.05)
     finally:
         for pid in processes_of(tmp_path, b"shard"):
             os.kill(pid, signal.SIGKILL)

@@ -35,7 +35,7 @@ def figures(cell):
 
 def none_is_left(cell, root, versions):
     """Wait until only the newest versions have files; then no other byte is counted."""
-    until(lambda: figures(cell)["payload_files"] == versions)
+    until(lambda: figures(cell)["payload_files"] == versions, pause_s=0.05)
     found = figures(cell)
     left = [file for file in root.glob("*/*-*") if not file.name.startswith("uses-")]
     shown = [found[name] for name in ("files_ahead", "files_ahead_bytes", "payload_drafts")]
@@ -67,7 +67,7 @@ def test_files_of_a_parent_that_dies_after_a_fork_are_gone(make_cell, run, root)
     cell = make_cell().start_all()
     worker = run(cell, "dies_after_a_fork")
     worker.expect("child")
-    until(lambda: figures(cell)["files_ahead"] > 0)
+    until(lambda: figures(cell)["files_ahead"] > 0, pause_s=0.05)
     worker.signal(signal.SIGKILL)
     worker.finish()
     none_is_left(cell, root, 1)
@@ -84,7 +84,7 @@ def test_files_of_a_client_that_is_killed_are_gone(make_cell, run, root):
     for role, said in (("rests", "rests"), ("uses_one_late", "holds")):
         worker = run(cell, role)
         worker.expect(said)
-        until(lambda: figures(cell)["files_ahead"] > 0)
+        until(lambda: figures(cell)["files_ahead"] > 0, pause_s=0.05)
         if said == "holds":
             worker.tell("fill")
             worker.expect("filled")
