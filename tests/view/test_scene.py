@@ -181,49 +181,6 @@ def test_capsules_are_spheres_and_cylinders():
     assert (bodies.places_m.tolist(), bodies.sizes_m.tolist()) == ([[0, 0, 1]], [[0.5, 0.5, 2.0]])
 
 
-@dataclass(frozen=True, eq=False)
-class Model:
-    dh: np.ndarray
-    base: np.ndarray
-    capsules: np.ndarray
-
-
-def test_an_arm_stands_as_its_joints_say():
-    """Two links of 1 m in a plane; the second joint is bent by a quarter turn."""
-    links = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]])
-    shapes = np.array([[0, 0, 1, 0, 0.1], [1, 0, 2, 0, 0.05]], np.float64)
-    model = shown(Model(links, moved(0.0, 0.0, 0.5), shapes), entity="arm", aspect="model")
-    joints = shown(np.array([0.0, np.pi / 2]), "joints", entity="arm", frame="cell", model="model")
-    data = {one.recorded.slot: one for one in (model, joints)}
-    (node,) = scene_of(data).nodes.values()
-    assert node is next(iter(scene_of(data).nodes.values()))
-    first, second = (capsule.ends_m for capsule in node.capsules)
-    assert np.allclose(first, [[0, 0, 0.5], [1, 0, 0.5]])
-    assert np.allclose(second, [[1, 0, 0.5], [1, 1, 0.5]])
-    assert scene_of({joints.recorded.slot: joints}).nodes == {}
-
-
-@pytest.mark.parametrize("waypoints", [[[0.0, 0.0], [np.pi, 0.0]], [[0.0, 0.0]], []])
-def test_a_path_of_joints_is_the_way_of_the_last_frame(waypoints):
-    """Half a turn of a straight arm of 2 m is half a circle, and not the line between its ends."""
-    links = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]])
-    model = Model(links, moved(0.0, 0.0, 0.5), np.zeros((0, 5)))
-    base = shown(model, entity="arm", aspect="model")
-    rows = np.array([*waypoints, [np.nan, 0.0]]).reshape(-1, 2)
-    path = shown(rows, "trajectory", entity="arm", aspect="path", frame="cell", model="model")
-    nodes = scene_of({one.recorded.slot: one for one in (base, path)}).nodes
-    if len(waypoints) < 2:
-        assert nodes == {}
-        return
-    places_m = nodes["online:arm/path#trajectory"].places_m
-    assert np.allclose(places_m[[0, -1]], [[2, 0, 0.5], [-2, 0, 0.5]], atol=1e-6)
-    assert np.allclose(np.linalg.norm(places_m[:, :2], axis=1), 2.0)
-    assert np.linalg.norm(np.diff(places_m, axis=0), axis=1).max() < 0.11
-    assert places_m[:, 1].min() > -1e-6
-    alone = scene_of({path.recorded.slot: path})
-    assert (alone.nodes, alone.remarks) == ({}, ())
-
-
 def test_a_datum_that_does_not_fit_its_kind_is_left_out_and_named():
     wrong = shown(np.zeros(4), "capsules", "trajectory")
     assert scene_of({wrong.recorded.slot: wrong})[::2] == (

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -18,8 +17,8 @@ if TYPE_CHECKING:
 
 STEP_RAD: Final = 0.05
 """Farthest that a joint goes from one place of a drawn path to the next."""
-STEPS_MAX: Final = 2000
-"""Most places between two waypoints."""
+PLACES_MAX: Final = 10_000
+"""Places of a longer path are thinned; of joints, that go farther, there are fewer on the way."""
 
 
 def arm_capsules(model: object, positions_rad: NDArray[Any]) -> tuple[Capsule, ...] | None:
@@ -31,7 +30,7 @@ def arm_capsules(model: object, positions_rad: NDArray[Any]) -> tuple[Capsule, .
     """
     poses = _poses(model, positions_rad)
     shapes = model.get("capsules") if isinstance(model, dict) else None
-    if poses is None or not _is_table(shapes, 5):
+    if poses is None or not _is_table(shapes, 5) or not len(shapes):
         return None
     first, first_m, second, second_m, radius_m = np.asarray(shapes, np.float64).T
     if min(first.min(), second.min()) < 0 or max(first.max(), second.max()) >= len(poses):
@@ -49,12 +48,23 @@ def arm_path(model: object, path_rad: NDArray[np.float64]) -> NDArray[np.float64
         model: As above; without capsules, too.
         path_rad: (M, J) waypoints of its joints, joined by straight lines of the joints.
     """
-    rows = [path_rad[:1]]
-    for begin, end in itertools.pairwise(path_rad):
-        count = min(STEPS_MAX, max(1, math.ceil(np.abs(end - begin).max(initial=0.0) / STEP_RAD)))
-        rows.append(begin + (end - begin) * np.linspace(0.0, 1.0, count + 1)[1:, None])
-    poses = _poses(model, np.concatenate(rows))
+    path_rad = thinned(path_rad)
+    with np.errstate(over="ignore"):
+        apart_rad = np.abs(np.diff(path_rad, axis=0)).max(axis=1, initial=0.0)
+    steps = np.clip(np.ceil(apart_rad / STEP_RAD), 1, PLACES_MAX)
+    steps = np.ceil(steps * min(1.0, PLACES_MAX / max(1.0, steps.sum()))).astype(int)
+    begins = np.repeat(np.arange(len(steps)), steps)
+    shares = (np.arange(1, len(begins) + 1) - (np.cumsum(steps) - steps)[begins]) / steps[begins]
+    rows = path_rad[begins] * (1.0 - shares[:, None]) + path_rad[begins + 1] * shares[:, None]
+    with np.errstate(over="ignore", invalid="ignore"):
+        poses = _poses(model, np.concatenate((path_rad[:1], rows)))
     return None if poses is None else poses[-1, :, :3, 3]
+
+
+def thinned(rows: NDArray[Any]) -> NDArray[Any]:
+    """Return a path (N, ...) with at most about `PLACES_MAX` of its rows, both ends among them."""
+    step = max(1, -(-len(rows) // PLACES_MAX))
+    return np.concatenate((rows[:-1:step], rows[-1:]))
 
 
 def _poses(model: object, positions_rad: NDArray[Any]) -> NDArray[np.float64] | None:

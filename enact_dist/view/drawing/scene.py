@@ -24,7 +24,7 @@ from enact_dist.recording.drawing.drawables import (
     drawables_of,
 )
 from enact_dist.recording.drawing.solids import outer_voxels
-from enact_dist.view.drawing.arms import arm_capsules, arm_path
+from enact_dist.view.drawing.arms import arm_capsules, arm_path, thinned
 from enact_dist.view.drawing.frames import InParent, placed
 from enact_dist.view.drawing.nodes import (
     AxesNode,
@@ -57,8 +57,6 @@ if TYPE_CHECKING:
 POINTS_MAX: Final = 100_000
 """Points of a larger cloud are thinned; the page says so."""
 TRIANGLES_MAX: Final = 300_000
-PLACES_MAX: Final = 10_000
-"""Places of a longer path are thinned."""
 CUBES_MAX: Final = 1_000
 """More voxels than this are drawn as square points."""
 VARIANTS_MAX: Final = 4
@@ -233,9 +231,8 @@ def _node(frame: str, drawable: Drawable | None, tint: Colour | None) -> Node | 
 def _path(frame: str, places_m: NDArray[np.float64], tint: Colour | None) -> LineNode | None:
     if len(places_m) < 2:
         return None
-    step = -(-len(places_m) // PLACES_MAX)
     with np.errstate(over="ignore"):
-        kept = np.concatenate((places_m[:-1:step], places_m[-1:])).astype(np.float32)
+        kept = thinned(places_m).astype(np.float32)
     return LineNode(frame, kept, tint or PATH_COLOUR) if np.isfinite(kept).all() else None
 
 
@@ -254,7 +251,7 @@ def _arm(
     described = robot_of(file) if file is not None else model
     if described is None:
         return None
-    key = ("arm", tint, id(described))
+    key = ("arm", type(joints), tint, id(described))
     known = shown.made.get(key)
     if known is None:
         _forget_older(shown.made, "arm")
@@ -315,8 +312,8 @@ def _thinned(slot: Slot, drawable: Drawable | None, node: Node | None) -> Iterat
         yield f"{slot} has more than {POINTS_MAX} points; one in {node.one_in} is shown"
     if isinstance(drawable, ShownMesh) and len(drawable.triangles) > TRIANGLES_MAX:
         yield f"{slot} has {len(drawable.triangles)} triangles; {TRIANGLES_MAX} are shown"
-    if isinstance(drawable, ShownTrajectory) and isinstance(node, LineNode):
-        count, kept = len(drawable.places_m), len(node.places_m)
+    if isinstance(drawable, ShownTrajectory | ShownJointPath) and isinstance(node, LineNode):
+        count, kept = len(drawable[0]), len(node.places_m)
         if kept < count:
             yield f"{slot} has {count} places; a line through {kept} of them is shown"
 
