@@ -2,17 +2,23 @@
 
 import socket
 import time
+from types import SimpleNamespace
 
 import pytest
 from polling import until
 from quiet_browser import QuietClient
-from view_samples import SHOWS, move, moved, shown, slot
+from view_samples import ARM, SHOWS, SLOT, move, moved, shown, slot
 
+from enact_dist import Aspect, Lock, Retention, Write
 from enact_dist.cli.main import main
+from enact_dist.core.protocol.parts import SlotState
 from enact_dist.errors import ConfigError
+from enact_dist.view.activity import CellActivity
+from enact_dist.view.catalogue import ListedState, SlotCatalogue
 from enact_dist.view.pages import page as pages
 from enact_dist.view.pages.page import Page
 from enact_dist.view.pages.server import free_port
+from enact_dist.view.pages.texts import row_of
 from enact_dist.view.pages.viewer import Viewer, ViewSettings
 
 
@@ -134,3 +140,58 @@ def test_a_resolution_out_of_range_is_refused(factor, capsys):
     with pytest.raises(SystemExit):
         main(["view", "cell.toml", "--resolution", factor])
     assert f"argument --resolution: {factor!r} is no " in capsys.readouterr().err
+
+
+def shown_row(page, name):
+    """Return the row of a datum, "" before there is one."""
+    texts = [str(handle.content) for handle in [*page._client.gui.handles.values()]]
+    rows = next((text for text in texts if "margin-bottom:3px" in text), "")
+    return next((row for row in rows.split("margin-bottom:3px") if f"<b>{name}</b>" in row), "")
+
+
+def test_rows_of_the_past_say_what_was_there_then(page, cell):
+    """Nothing of a datum that came later; why it was null; how large the version was."""
+    page.start()
+    until(lambda: "by writer" in shown_row(page, "arm/speed"))
+    text = Write(cell.world("online"), ARM, Aspect("text", str, retention=Retention(versions=9)))
+    before_ns, stamps = move(cell, 1.0).stamp_ns, []
+    for value in ("x" * 10_000, None, "now"):
+        with Lock(text) as lock:
+            if value is None:
+                del lock[text]
+            else:
+                lock[text] = value
+        stamps.append(lock.position.stamp_ns)
+    until(lambda: "by writer" in shown_row(page, "arm/text"))
+    for at_ns, wanted, lacking in (
+        (before_ns, "str", " ago"),
+        (stamps[0], "10.0 kB · v1 · 0.0 ms ago", "null"),
+        (stamps[1], "null: DELETED", "small"),
+        (stamps[2], "small · v3 · 0.0 ms ago · by writer", "null"),
+    ):
+        page.contents.look_back([SLOT], at_ns)
+
+        def is_right(wanted=wanted, lacking=lacking):
+            row = shown_row(page, "arm/text")
+            return wanted in row and lacking not in row and "None" not in row
+
+        until(is_right)
+
+
+def test_a_row_names_its_writer_while_the_datum_changes():
+    """The newest version whose writer is known is then not the newest one."""
+    slot_, samples = slot("arm", "speed"), SimpleNamespace(of=lambda *_: ())
+    cause = SimpleNamespace(actor="writer")
+    entry = SimpleNamespace(state=SlotState(slot_, 1, 1, 0, None, False, False, ""), cause=cause)
+    catalogue = SlotCatalogue()
+    catalogue.note(slot_, ListedState(2, 2, null=False), gap=0, now_s=1.0)
+    viewer = SimpleNamespace(
+        feed=SimpleNamespace(catalogue=catalogue),
+        entry=lambda _: entry,
+        size=lambda _: 0,
+        type_of=lambda _: "float",
+        activity_now=CellActivity,
+    )
+    assert "v2" in row_of(viewer, samples, slot_, None, "", 0)
+    assert "by writer" in row_of(viewer, samples, slot_, None, "", 0)
+    assert "by writer" not in row_of(viewer, samples, slot_, None, "", 5)

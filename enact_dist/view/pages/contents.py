@@ -176,6 +176,8 @@ class PageContents:
         shown: dict[Slot, ShownDatum] = {}
         unfit = "; ".join(why for _, why in found.denied[:1])
         for slot, recorded in found.data.items():
+            if not recorded.version:
+                continue  # it was never set before the moment
             if slot in known and known[slot].state == recorded.state:
                 shown[slot] = before[slot]
                 continue

@@ -5,13 +5,13 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING
 
-from enact_dist.recording.exact import Recorded
 from enact_dist.view import markup
 from enact_dist.world.trees import shown_s
 
 if TYPE_CHECKING:
     from enact_dist.core.protocol.datum import Slot
     from enact_dist.core.protocol.messages import VersionEntry
+    from enact_dist.recording.exact import Recorded
     from enact_dist.view.catalogue import ListedState
     from enact_dist.view.drawing.scene import ShownDatum
     from enact_dist.view.pages.contents import PageContents
@@ -38,13 +38,17 @@ def row_of(
         past_ns: As of which moment; 0: the present.
     """
     catalogue, now_s = viewer.feed.catalogue, time.monotonic()
-    entry, size = viewer.entry(slot), viewer.size(slot)
-    state: ListedState | Recorded | None = catalogue.state(slot)
-    if past_ns:
-        state = shown.recorded if shown is not None else None
-    name = markup.slot_name(slot).removeprefix(below)
-    value = markup.text(markup.short_value(shown.value)) if shown is not None else ""
-    line = f"<b>{markup.text(name)}</b> {value} {markup.plot(samples.of(slot, past_ns))}"
+    recorded = shown.recorded if shown is not None else None
+    state: ListedState | Recorded | None = recorded if past_ns else catalogue.state(slot)
+    size, by = viewer.size(slot), _writer_of(viewer.entry(slot), recorded, past_ns)
+    if past_ns and recorded is not None:
+        size = recorded.datum.size if recorded.datum is not None else None
+    name = markup.text(markup.slot_name(slot).removeprefix(below))
+    value = markup.short_value(shown.value) if shown is not None else ""
+    if recorded is not None and recorded.null_reason:
+        value = f"null: {recorded.null_reason}"
+    plot = markup.plot(samples.of(slot, past_ns))
+    line = f"<b>{name}</b> {markup.text(value)} {plot}"
     facts = [viewer.type_of(slot.aspect)]
     if size is not None:
         facts.append(markup.size(size))
@@ -52,7 +56,6 @@ def row_of(
     facts.append(f"{rate_hz:.3g} Hz" if rate_hz is not None else "")
     if state is not None:
         facts += [f"v{state.version}", markup.age(past_ns or time.time_ns(), state.stamp_ns)]
-    by = _writer_of(entry, state)
     if by is not None:
         facts.append(f"by {by or '(unnamed)'}")
     held = viewer.activity_now().held.get(str(slot), "")
@@ -61,13 +64,16 @@ def row_of(
     return f'<div style="margin-bottom:3px">{line}<div style="color:#888">{under}</div></div>'
 
 
-def _writer_of(entry: VersionEntry | None, state: ListedState | Recorded | None) -> str | None:
-    """Return who wrote a version, None if that is not known of this one."""
-    if isinstance(state, Recorded) and state.actor:
-        return state.actor
-    if entry is None or entry.cause is None or state is None:
-        return None
-    return entry.cause.actor if entry.state.version == state.version else None
+def _writer_of(entry: VersionEntry | None, recorded: Recorded | None, past_ns: int) -> str | None:
+    """Return who wrote a version of the past, or else the newest one; None: unknown."""
+    if past_ns:
+        if recorded is None:
+            return None
+        if recorded.actor:
+            return recorded.actor
+        if entry is None or entry.state[1:3] != recorded.state:
+            return None
+    return entry.cause.actor if entry is not None and entry.cause is not None else None
 
 
 def datum_of(
