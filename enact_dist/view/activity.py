@@ -122,9 +122,10 @@ class Activity(Follower):
 
     def _ask(self) -> None:
         rates = self._looks.add(self._source.cell.look())
+        self._run_times.add(rates.actors)
         self.now = CellActivity(
             table(rates, "l"),
-            table(rates, "a", self._run_times.add(rates.actors)),
+            table(rates, "a", self._run_times),
             table(rates, "s") + table(rates, "c"),
             held_of(rates.locks),
         )
@@ -159,8 +160,8 @@ class RunTimes:
     def __init__(self) -> None:
         self._known: dict[tuple[str, ...], deque[tuple[int, dict[str, float]]]] = {}
 
-    def add(self, actors: Iterable[ActorRates]) -> dict[tuple[str, ...], str]:
-        """Take a look; return the strip of each actor (its name, host and process)."""
+    def add(self, actors: Iterable[ActorRates]) -> None:
+        """Take a look: of these actors, and of no others, run times are known from now on."""
         before, self._known = self._known, {}
         for actor in actors:
             key = (actor.name, actor.host, str(actor.pid))
@@ -169,16 +170,19 @@ class RunTimes:
                 took_ms = {"p50": actor.update_p50_ms, "p99": actor.update_p99_ms}
                 known.append((time.time_ns(), took_ms))
             self._known[key] = known
-        return {key: markup.plot([*known]) for key, known in self._known.items()}
+
+    def strip(self, *key: str) -> markup.Markup:
+        """Return the run times of an actor (its name, host and process) as a small picture."""
+        return markup.Markup(markup.plot([*self._known.get(key, ())]))
 
 
-def table(rates: CellRates, key: str, strips: Mapping[tuple[str, ...], str] | None = None) -> str:
+def table(rates: CellRates, key: str, run_times: RunTimes | None = None) -> str:
     """Return a table of `enact top` as HTML, without what needs a look at all slots.
 
     Args:
         rates: What two looks have shown.
         key: Which table.
-        strips: Of actors: their run times, which follow their names.
+        run_times: Those of actors, which follow the names of those that are shown.
     """
     (found,) = (one for one in TABLES if one.key == key)
     lines, count = found.lines(rates, markup.ROWS_SHOWN_MAX)
@@ -186,9 +190,9 @@ def table(rates: CellRates, key: str, strips: Mapping[tuple[str, ...], str] | No
     kept = [index for index, name in enumerate(names) if name != "wrote"]
     rows = [[line[index] for index in kept] for line in lines]
     shown = [names[index] for index in kept]
-    if strips is not None:
+    if run_times is not None:
         places = [shown.index(name) for name in ("actor", "host", "pid")]
         for row in rows:
-            row.insert(1, markup.Markup(strips.get(tuple(row[place] for place in places), "")))
+            row.insert(1, run_times.strip(*(row[place] for place in places)))
         shown.insert(1, "run time")
     return markup.table(shown, rows, empty=found.empty, count=count)
