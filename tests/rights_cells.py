@@ -1,4 +1,7 @@
-"""A cell with keys and rights: `reader` may read a part and observe, `blind` may do nothing."""
+"""A cell with keys and rights, of programs that may do a part of all.
+
+`reader` may read a part and observe, `taker` may only read, all, and `blind` may do nothing.
+"""
 
 import sys
 from pathlib import Path
@@ -10,11 +13,14 @@ from key_cells import KeyCell
 RIGHTS = """
 [rights]
 default = "none"
-programs = ["reader", "blind"]
+programs = ["reader", "taker", "blind"]
 observe = ["reader"]
 [[rights.allow]]
 who = "reader"
 read = "online:open/**"
+[[rights.allow]]
+who = "taker"
+read = "online:**"
 """
 
 

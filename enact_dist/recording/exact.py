@@ -45,8 +45,8 @@ from enact_dist.core.protocol.messages import (
     CAUSE_COMMIT,
     CAUSE_FORK,
     READS_MAX,
+    Cause,
     DatumRead,
-    VersionEntry,
 )
 from enact_dist.errors import ProtocolError
 from enact_dist.terms import NullReason
@@ -133,19 +133,16 @@ class Recorded:
         return 256 + READ_BYTES * len(self.reads) + datum_bytes
 
 
-def recorded_of(
-    wanted: Wanted, entry: VersionEntry | None, found: Retained, commit: int
-) -> Recorded:
+def recorded_of(wanted: Wanted, cause: Cause | None, found: Retained, commit: int) -> Recorded:
     """Return a version for a recording.
 
     Args:
         wanted: Which it is.
-        entry: What its shard knows of it; None: nothing any more.
+        cause: Where it comes from; None: that is not known.
         found: What it is.
         commit: Number of its commit in the recording.
     """
     facts = (wanted.slot, wanted.version, wanted.stamp_ns, wanted.shard, commit)
-    cause = entry.cause if entry is not None else None
     if cause is None:
         return Recorded(*facts, found.datum, found.null_reason)
     return Recorded(

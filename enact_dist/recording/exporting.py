@@ -13,7 +13,7 @@ from enact_dist.errors import ConfigError
 from enact_dist.recording.exact import recorded_of
 from enact_dist.recording.file import RecordingFile
 from enact_dist.terms import Access
-from enact_dist.world.version_data import Retained, Wanted, explained
+from enact_dist.world.version_data import Retained, Wanted, causes_of
 
 if TYPE_CHECKING:
     import os
@@ -48,8 +48,8 @@ class ExportSummary:
 def world_as_of(world: WorldContext, at_ns: int = 0) -> Iterator[Recorded]:
     """Yield every datum of a world context, all of one moment, over all shards, with its cause.
 
-    Not more than `PORTION_BYTES` are in memory at once, or the largest datum; the shards keep the
-    rest until then.
+    Not more than `PORTION_BYTES` of data are in memory at once, or the largest datum; the shards
+    keep the rest until then.  A program that may not observe the cell gets no causes.
 
     Args:
         world: The world context.
@@ -67,15 +67,13 @@ def world_as_of(world: WorldContext, at_ns: int = 0) -> Iterator[Recorded]:
         return
     with HeldView(session, items, past_ns=at_ns) as view:
         states = [reading for reading in view.states if not reading.state.null_reason]
-        for portion in _portions(sorted(states, key=lambda reading: reading.state.slot)):
+        states.sort(key=lambda reading: reading.state.slot)
+        wanted = {s.slot: Wanted(s.stamp_ns, s.slot, s.version, shard) for shard, _, s in states}
+        causes = causes_of(session, [*wanted.values()])  # now: data that change lose them
+        for portion in _portions(states):
             data = view.fetch(portion)
-            entries = explained(
-                session, [Wanted(s.stamp_ns, s.slot, s.version, shard) for shard, _, s in portion]
-            )
-            for shard, _, state in portion:
-                wanted = Wanted(state.stamp_ns, state.slot, state.version, shard)
-                found = Retained("", data.pop(state.slot))
-                yield recorded_of(wanted, entries.get(wanted), found, 0)
+            for one in (wanted[reading.state.slot] for reading in portion):
+                yield recorded_of(one, causes.get(one), Retained("", data.pop(one.slot)), 0)
 
 
 def _portions(readings: list[Reading]) -> Iterator[list[Reading]]:

@@ -418,7 +418,8 @@ class Recorder:
         found: Mapping[Wanted, Retained],
     ) -> None:
         self.summary.versions += len(group)
-        versions = tuple(recorded_of(w, entries.get(w), found[w], commit) for w in group)
+        causes = {w: entries[w].cause for w in group if w in entries}
+        versions = tuple(recorded_of(w, causes.get(w), found[w], commit) for w in group)
         self._disk.put(versions, log_ns)
 
     def _finish(self, watch: Watch) -> None:

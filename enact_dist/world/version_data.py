@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, NamedTuple
 from enact_dist.access import asking
 from enact_dist.access.snapshot import HeldView
 from enact_dist.access.writes import Writing
-from enact_dist.core.protocol.messages import Item, SlotVersion, VersionEntry
-from enact_dist.errors import ForgottenError, LeaseLostError
+from enact_dist.core.protocol.messages import Cause, Item, SlotVersion, VersionEntry
+from enact_dist.errors import ForgottenError, LeaseLostError, PermissionDeniedError
 from enact_dist.terms import Access
 from enact_dist.wire.limits import ITEMS_MAX
 from enact_dist.wire.payload import Encoded
@@ -59,6 +59,31 @@ def explained(session: Session, wanted: Sequence[Wanted]) -> dict[Wanted, Versio
     }
     keys = {each: (each.slot, each.version, each.stamp_ns) for each in wanted}
     return {each: found[key] for each, key in keys.items() if key in found}
+
+
+def causes_of(session: Session, wanted: Sequence[Wanted]) -> dict[Wanted, Cause]:
+    """Return the causes of these versions, as far as they are known and this program may ask.
+
+    One version of each commit is asked about first: its cause names what else the commit has set.
+
+    Raises:
+        ShardUnreachableError: A shard does not answer.
+    """
+    found: dict[Wanted, Cause] = {}
+    commits: dict[tuple[str, int], list[Wanted]] = {}
+    for each in wanted:
+        commits.setdefault((each.shard, each.stamp_ns), []).append(each)
+    try:
+        firsts = explained(session, [same[0] for same in commits.values()])
+        for first, entry in firsts.items():
+            if (cause := entry.cause) is not None:
+                of_it = frozenset((*cause.writes, SlotVersion(first.slot, first.version)))
+                same = commits[first.shard, first.stamp_ns]
+                found |= {w: cause for w in same if SlotVersion(w.slot, w.version) in of_it}
+        rest = explained(session, [each for each in wanted if each not in found])
+    except PermissionDeniedError:
+        return {}
+    return found | {w: entry.cause for w, entry in rest.items() if entry.cause is not None}
 
 
 def between(session: Session, slot: Slot, shard: str, first: int, last: int) -> list[Wanted]:

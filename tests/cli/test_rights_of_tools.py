@@ -14,6 +14,7 @@ from rights_cells import guarded_cell
 from enact_dist import Aspect, Entity, Lock, Write, connect
 from enact_dist.cli.main import main
 from enact_dist.errors import LeaseLostError
+from enact_dist.recording.reading import Recording
 
 COUNT = Aspect("count", int)
 pytestmark = pytest.mark.carrier("zenoh")
@@ -75,6 +76,16 @@ def test_lists_leave_out_what_is_not_readable(run):
         assert status == 0
         assert f"({seen} data)" in out
     assert run("blind", ["shard", "check"])[0] == 0
+
+
+@pytest.mark.parametrize(("name", "writer"), [("ada", "ada"), ("taker", "")])
+def test_an_export_needs_no_more_than_the_right_to_read(run, tmp_path, name, writer):
+    """Who may not observe the cell gets the data without their causes."""
+    path = tmp_path / "all.mcap"
+    assert run(name, ["world", "export", "online", "--out", str(path)])[::2] == (0, "")
+    versions = [version for commit in Recording(path).commits() for version in commit.versions]
+    found = {(one.slot.entity, one.actor) for one in versions}
+    assert found == {("open/x", writer), ("secret/x", writer)}
 
 
 def test_a_recording_has_what_is_readable_and_names_the_rest(cell, tmp_path, monkeypatch):

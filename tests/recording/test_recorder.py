@@ -410,6 +410,26 @@ def test_export_names_the_causes_of_its_data(online, tmp_path):
     assert made.reads[0].stamp_ns == versions["bench"].stamp_ns
 
 
+def test_export_asks_once_for_the_cause_of_a_commit(online, tmp_path, monkeypatch):
+    """A shard would name all that a commit has set for each of its data; those of a fork differ."""
+    asked, ask = [], version_data.explained
+    monkeypatch.setattr(
+        version_data,
+        "explained",
+        lambda session, some: asked.append(len(some)) or ask(session, some),
+    )
+    put(*((Write(online, Entity(f"part/{n}"), COUNT), n) for n in range(50)))
+    export_world(online, tmp_path / "now.mcap")
+    assert asked == [1, 0]
+    export_world(online.fork("copy"), tmp_path / "copy.mcap")
+    for name, kind in (("now", "commit"), ("copy", "fork")):
+        found = commits_of(tmp_path / f"{name}.mcap")
+        versions = [version for commit in found for version in commit.versions]
+        assert [one.kind for one in versions] == [kind] * 50
+        reads = [read.slot for one in versions for read in one.reads]
+        assert reads == [one.slot._replace(context="online") for one in versions if kind == "fork"]
+
+
 def test_export_ends_and_leaves_no_file_once_it_is_too_large(online, tmp_path, monkeypatch):
     """Nothing is fetched after the portion with which it passed the bound."""
     monkeypatch.setattr(exporting, "PORTION_BYTES", 1)
