@@ -115,7 +115,7 @@ class RecordingSource:
         """Return every moment of the recording as if each of these slots had it."""
         return {slot: list(enumerate(self.timeline.stamps_ns, 1)) for slot in slots}
 
-    def samples(self, slot: Slot, most: int) -> list[tuple[int, Datum]]:
+    def samples(self, slot: Slot, most: int, bytes_max: int) -> list[tuple[int, Datum]]:
         """Return stamps and data of a slot, spread over the recording; the file is read once more.
 
         Raises:
@@ -125,7 +125,7 @@ class RecordingSource:
         seen, every = 0, 1
         for commit in Recording(self._recording.path).commits():
             for one in commit.versions:
-                if one.slot != slot or one.datum is None:
+                if one.slot != slot or one.datum is None or one.datum.size > bytes_max:
                     continue
                 if seen % every == 0:
                     found.append((one.stamp_ns, one.datum))

@@ -82,8 +82,8 @@ class DataSource(Protocol):
     def histories(self, slots: Sequence[Slot]) -> Histories:
         """Return which versions of these slots are known."""
 
-    def samples(self, slot: Slot, most: int) -> list[tuple[int, Datum]]:
-        """Return stamps and data of some versions of a slot that are no nulls, in their order."""
+    def samples(self, slot: Slot, most: int, bytes_max: int) -> list[tuple[int, Datum]]:
+        """Return stamps and data of some versions of a slot, no nulls, none larger, in order."""
 
     def tree_of(self, way: str, recorded: Recorded, depth: int) -> CauseTree | EffectTree:
         """Return the causes (``why``) or the effects (``impact``) of a version."""
@@ -272,7 +272,7 @@ class CellSource:
                     found.setdefault(state.slot, []).append((state.version, state.stamp_ns))
         return {slot: sorted(each, key=lambda one: one[1]) for slot, each in found.items()}
 
-    def samples(self, slot: Slot, most: int) -> list[tuple[int, Datum]]:
+    def samples(self, slot: Slot, most: int, bytes_max: int) -> list[tuple[int, Datum]]:
         """Return stamps and data of the newest versions of a slot, as far as they are kept.
 
         Raises:
@@ -282,7 +282,7 @@ class CellSource:
         wanted = [Wanted(stamp_ns, slot, version, shard) for version, stamp_ns in versions]
         found = found_of(self.session, wanted)
         data = [(one.stamp_ns, found[one].datum) for one in wanted if one in found]
-        return [(stamp_ns, datum) for stamp_ns, datum in data if datum is not None]
+        return [(at_ns, one) for at_ns, one in data if one is not None and one.size <= bytes_max]
 
     def explained(self, versions: Mapping[Slot, int]) -> dict[Slot, VersionEntry]:
         """Return size and writer of a version of each of some slots whose shards answer."""

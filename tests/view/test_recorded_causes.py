@@ -138,9 +138,24 @@ def test_rows_of_a_recording_are_as_of_its_moment(cell, tmp_path):
         page.close()
         page._thread.join()
     slot = next(s for s in source.catalogue.slots("online") if s.aspect == "speed")
-    assert len(source.samples(slot, 100)) == 21
-    spread = [decode_untyped(datum) for _, datum in source.samples(slot, 6)]
+    assert len(source.samples(slot, 100, 64)) == 21
+    spread = [decode_untyped(datum) for _, datum in source.samples(slot, 6, 64)]
     assert spread == [0.5 + number for number in range(0, 21, 4)]
+
+
+def test_numbers_of_a_recording_are_those_of_small_versions(cell, tmp_path):
+    """Large ones would all be in memory at once, for nothing that is shown."""
+    report = Write(cell.world("online"), CELL, REPORT)
+
+    def write():
+        for text in ("x" * 100_000, "y" * 100_000, "small"):
+            with Lock(report) as lock:
+                lock[report] = text
+
+    source = recorded(cell, tmp_path / "run.mcap", more=write)
+    slot = next(s for s in source.catalogue.slots("online") if s.aspect == "report")
+    found = [decode_untyped(datum) for _, datum in source.samples(slot, 100, 4096)]
+    assert [text[:6] for text in found] == ["first:", "second", "small"]
 
 
 def test_a_recording_of_before_has_no_causes_and_names_its_writers():

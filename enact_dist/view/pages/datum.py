@@ -65,11 +65,10 @@ class Samples:
         Raises:
             EnactError: Its shard does not answer, or the recording cannot be read.
         """
-        learned = source.samples(slot, markup.SAMPLES_MAX)
+        learned = source.samples(slot, markup.SAMPLES_MAX, SMALL_BYTES)
         newer = list(self._known.pop(slot, ()))
         for stamp_ns, datum in learned:
-            if datum.size <= SMALL_BYTES:
-                self._add(slot, stamp_ns, decode_untyped(datum))
+            self._add(slot, stamp_ns, decode_untyped(datum))
         known = self._known.setdefault(slot, deque(maxlen=markup.SAMPLES_MAX))
         known.extend(one for one in newer if not known or one[0] > known[-1][0])
 
