@@ -4,7 +4,7 @@
 storer    writes an array anew at each line ``ENTITY BYTES``
 notifier  at a line, writes numbered and stamped arrays with pauses between them
 fetcher   fetches one datum over and over, and says when it begins and when it has it
-waiter    at a line, its threads queue for one slot; says when each had it and began to leave it
+waiter    at a line, its threads queue for a slot; says when each had it and began to leave it
 cameras   from the time in a line on, a thread per camera writes images, with history and without
 ========  =======================================================================================
 
@@ -75,7 +75,7 @@ def _fetch(world: WorldContext, options: dict[str, Any]) -> None:
 
 
 def _wait(world: WorldContext, options: dict[str, Any]) -> None:
-    (write,) = slots(world, 1, entity="waiters")
+    write = slots(world, options["slot"] + 1, entity="waiters")[-1]
     with Lock(write, wait_s=WAIT_S):
         pass
     print("ready:", flush=True)

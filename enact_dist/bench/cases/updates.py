@@ -288,8 +288,10 @@ def _per_act_us(counts: list[int], seconds_s: float, failed: list[BaseException]
 
 
 def run_waiters(run: Run) -> None:
-    """Hand-over of one slot: how long no thread holds it while several wait for it.
+    """Hand-over of one slot, and the rate of processes that update one slot or a slot each.
 
+    A hand-over is how long no thread holds the slot while several wait for it.  The rates stand
+    beside those of one process alone: what contention costs, and what the shard's processor does.
     The budgets speak of the core's hand-over alone, which the bench `core` measures.
     """
     floor = floor_of(run.place.way(run.place.carrier))
@@ -297,10 +299,13 @@ def run_waiters(run: Run) -> None:
         Case("waiters", f"{count} threads in 2 processes, hand-over", _hand_over(run, count), floor)
         for count in THREADS
     ]
+    one, each = "1 process alone, per update", f"{FOUR} processes, each its own slot, per update"
     ended = f"{FOUR} processes, one slot, per update, each grant ends with its lock"
     goal = times(1.0 / 0.97, ("waiters", ended), "≥ 0.97 of the rate without kept grants")
     stays = f"{FOUR} processes, one slot, per update, grants may stay"
     cases += [
+        Case("waiters", one, _contention(run, retain="0", processes=1), floor),
+        Case("waiters", each, _contention(run, retain="0", apart=True), floor),
         Case("waiters", ended, _contention(run, retain="0"), floor),
         Case("waiters", stays, _contention(run, retain="1"), floor, goal),
     ]
@@ -316,23 +321,32 @@ def _hand_over(run: Run, count: int) -> Callable[[float], list[float]]:
     return measure
 
 
-def _contention(run: Run, *, retain: str) -> Callable[[float], list[float]]:
-    """Return what measures processes that update one slot as fast as they can."""
+def _contention(
+    run: Run, *, retain: str, processes: int = FOUR, apart: bool = False
+) -> Callable[[float], list[float]]:
+    """Return what measures processes that update one slot, or a slot each, as fast as they can."""
 
     def measure(seconds_s: float) -> list[float]:
         with environment(ENACT_RETAIN=retain):
-            held = _held(run, FOUR, 1, seconds_s)
+            held = _held(run, processes, 1, seconds_s, apart=apart)
         return [(held[-1][0] - held[0][0]) / 1e3 / (len(held) - 1)]  # their mean: a rate
 
     return measure
 
 
-def _held(run: Run, processes: int, threads: int, seconds_s: float) -> list[tuple[int, int]]:
-    """Let processes update one slot; return when each lock was granted and left, in order (ns)."""
+def _held(
+    run: Run, processes: int, threads: int, seconds_s: float, *, apart: bool = False
+) -> list[tuple[int, int]]:
+    """Let processes update one slot, or each its own if `apart`.
+
+    Returns:
+        When each lock was granted and left, in the order of the grants (ns).
+    """
     place = run.place
     while True:
         options: dict[str, Any] = {"threads": threads, "seconds_s": seconds_s}
-        with place.workers([("waiter", options)] * processes, carrier=place.carrier) as workers:
+        roles = [("waiter", {**options, "slot": n * apart}) for n in range(processes)]
+        with place.workers(roles, carrier=place.carrier) as workers:
             for worker in workers:
                 worker.tell("go")
             held = [

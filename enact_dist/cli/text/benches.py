@@ -33,7 +33,9 @@ BENCHES: Final = {
     ),
     "multi": Told("up to 32 slots in a lock, 8 threads side by side, slots on several shards"),
     "durable": Told("commits that survive a power cut: one, from several threads, of 10 MB"),
-    "waiters": Told("hand-over of a slot for which 2 to 32 threads wait", alone=False),
+    "waiters": Told(
+        "hand-over of a slot to 2 to 32 waiting threads; updates of 1 and 4 clients", alone=False
+    ),
     "fetch": Told("reading arrays of 1 kB to 100 MB, seen before, new, from afar", minutes=True),
     "publish": Told("writing arrays of 1 kB to 100 MB, and committing what was filled in place"),
     "wakeup": Told("from a commit in one process to its array in another", alone=False),
