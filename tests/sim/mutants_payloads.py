@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from enact_dist.link.memory import payload_desk
+from enact_dist.link.memory.ahead import NamesAhead
 from enact_dist.link.memory.names import UsedNames
+from enact_dist.link.memory.payload_client import SharedPayloads
 from enact_dist.link.memory.payload_desk import PayloadDesk
 
 if TYPE_CHECKING:
@@ -63,3 +65,89 @@ def gives_up_drafts_of_holders(patch: Patch) -> None:
 def makes_drafts_of_late_slices(patch: Patch) -> None:
     """A late slice of a payload that was adopted and is gone makes a draft of it again."""
     patch(UsedNames, "add", lambda _names, _name: None)
+
+
+# ---------------------------------------------------------------- files ahead
+
+
+def makes_a_file_again_that_was_taken_back(patch: Patch) -> None:
+    """What was taken back is forgotten: its name comes again, with an empty file."""
+    remove = PayloadDesk._remove
+
+    def wrong(self: PayloadDesk, files: list[str]) -> Any:
+        gone = remove(self, files)
+        self._taken_back = UsedNames()
+        return gone
+
+    patch(PayloadDesk, "_remove", wrong)
+
+
+def leaves_files_ahead_to_both_of_a_fork(patch: Patch) -> None:
+    """A forked child goes on with the numbers of its parent."""
+    patch(SharedPayloads, "leave_pages", lambda _payloads: None)
+
+
+def gives_a_number_to_two_threads(patch: Patch) -> None:
+    """A number is used again while the file ahead of it is there."""
+    take = NamesAhead.take
+
+    def wrong(self: NamesAhead, size: int, now_s: float) -> tuple[int, bool]:
+        number, ready = take(self, size, now_s)
+        self._rows[size].number -= ready
+        return number, ready
+
+    patch(NamesAhead, "take", wrong)
+
+
+def makes_ahead_into_the_room_of_others(patch: Patch) -> None:
+    """Files ahead take all of the room, not half of it."""
+    made_ahead = PayloadDesk._made_ahead
+
+    def wrong(self: PayloadDesk, file: str, wanted: Any) -> bool:
+        self._bytes_max *= 2
+        try:
+            return made_ahead(self, file, wanted)
+        finally:
+            self._bytes_max //= 2
+
+    patch(PayloadDesk, "_made_ahead", wrong)
+
+
+def keeps_files_ahead_of_the_dead(patch: Patch) -> None:
+    """A file that nobody has asked for outlives its session."""
+    given_up = payload_desk.given_up
+
+    def wrong(drafts: Any, *others: Any) -> list[str]:
+        return [file for file in given_up(drafts, *others) if drafts[file].asked]
+
+    patch(payload_desk, "given_up", wrong)
+
+
+def leaves_the_files_of_what_is_gone(patch: Patch) -> None:
+    """Bytes are no longer counted, and their file stays."""
+    ended = PayloadDesk._ended
+    patch(PayloadDesk, "_ended", lambda desk, file, _disk, size: ended(desk, file, None, size))
+
+
+def counts_no_files_ahead(patch: Patch) -> None:
+    """Files made ahead take room that nobody counts."""
+    made_ahead = PayloadDesk._made_ahead
+
+    def wrong(self: PayloadDesk, file: str, wanted: Any) -> bool:
+        used = self._bytes
+        made = made_ahead(self, file, wanted)
+        self._bytes = used
+        return made
+
+    patch(PayloadDesk, "_made_ahead", wrong)
+
+
+def publishes_what_its_client_may_still_fill(patch: Patch) -> None:
+    """A commit that names no payload gets the newest file of its session."""
+    adopt = PayloadDesk._adopt
+
+    def wrong(self: PayloadDesk, file: str, size: int) -> Any:
+        others = [name for name, draft in self._drafts.items() if draft.size == size]
+        return adopt(self, file if file in self._drafts or not others else others[-1], size)
+
+    patch(PayloadDesk, "_adopt", wrong)

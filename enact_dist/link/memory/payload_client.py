@@ -14,7 +14,6 @@ import contextlib
 import itertools
 import logging
 import os
-import stat
 import threading
 import time
 import weakref
@@ -132,6 +131,11 @@ class _Shared:
         self.page: ClientPage | None = None
         self.keeps = False
 
+    def opened(self, file: str, size: int, access: int) -> int:
+        """Open a payload; see `OpenedFolder.opened`."""
+        assert self.folder is not None
+        return self.folder.opened(file, size, access)
+
     def __del__(self) -> None:
         if self.folder is not None:
             self.folder.close()
@@ -145,18 +149,28 @@ class SharedPayloads:
         call: Makes one call to a shard; None: no answer.
         count: Adds to a counter of the session.
         inside: Whether the only shard runs in this process and takes data without a copy.
+        open_folder: Opens the folder of a name and a nonce, as `open_shared` does.
+        now_s: Measures how long no payload of a length was made.
 
     Attributes:
         inside: As above.
     """
 
     def __init__(
-        self, session: str, call: Call, count: Callable[[str], None], *, inside: bool = False
+        self,
+        session: str,
+        call: Call,
+        count: Callable[[str], None],
+        *,
+        inside: bool = False,
+        open_folder: Callable[[str, bytes], OpenedFolder] = open_shared,
+        now_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self.inside: Final = inside
         self._session = session
         self._call = call
         self._count = count
+        self._open_folder, self._now_s = open_folder, now_s
         self._rows: Final = itertools.count(1).__next__
         self._mutex = threading.Lock()
         self._shards: dict[str, _Shared] = {}
@@ -173,7 +187,7 @@ class SharedPayloads:
             self._shards[welcome.shard] = shared = _Shared(welcome, NamesAhead(self._rows))
             if shared.name:
                 try:
-                    shared.folder = open_shared(shared.name, shared.nonce)
+                    shared.folder = self._open_folder(shared.name, shared.nonce)
                     shared.keeps = shared.folder.files >= 0 and retains()
                 except EnactError as error:
                     self._count("payload_folders_elsewhere")
@@ -245,40 +259,52 @@ class SharedPayloads:
         Raises:
             NoRoomError: The shard's limit is reached, and it has no history left to remove.
         """
+        begun = self.begin(shard, size)
+        if not isinstance(begun, Stage):
+            return begun
+        return self.begun(shard, begun, self._call(shard, begun))
+
+    def begin(self, shard: str, size: int) -> Draft | Stage | None:
+        """Open a file that is there already, or return the question for one, for `begun`.
+
+        Returns:
+            None if the bytes have to go into messages.
+        """
         shared = self._folder(shard)
         if shared is None or size <= PAYLOAD_BYTES_MIN:
             return None
         with self._mutex:
-            number, ready = shared.ahead.take(size, time.monotonic())
+            number, ready = shared.ahead.take(size, self._now_s())
         file = f"{self._session}-{number:x}"
         if ready:
             with contextlib.suppress(OSError):  # not there: it is asked for
-                return Draft(shard, file, size, self._opened(shared, file, size, os.O_RDWR))
+                return Draft(shard, file, size, shared.opened(file, size, os.O_RDWR))
         with self._mutex:
-            ahead = shared.ahead.asks(size)
-        answer = self._call(shard, Stage(self._session, file, 0, size, NOTHING, ahead))
+            return Stage(self._session, file, 0, size, NOTHING, shared.ahead.asks(size))
+
+    def begun(self, shard: str, asked: Stage, answer: Answer | None) -> Draft | None:
+        """Open the file that a shard has made as asked; None if messages must carry the bytes.
+
+        Raises:
+            NoRoomError: As `draft`.
+        """
         if isinstance(answer, Refused) and answer.code == NO_ROOM:
             raise error_of(answer)
-        if (
-            not isinstance(answer, Staged)
-            or not answer.shared
-            or not DRAFT_NAME.match(answer.draft)
-        ):
-            self._count("payload_fallbacks")
-            if isinstance(answer, Staged):
-                self.drop(shard, file)
-            return None
-        try:
-            name = answer.draft or file
-            return Draft(shard, file, size, self._opened(shared, name, size, os.O_RDWR))
-        except OSError as error:
-            # Most likely the folder is read-only here.
-            with self._mutex:
-                shared.ahead.unusable(size)
-            self._count("payload_fallbacks")
-            _log.info("payload %s of shard %s: %s", file, shard, error)
+        file, size, shared = asked.file, asked.total, self._folder(shard)
+        made = answer if isinstance(answer, Staged) and answer.shared else None
+        if shared is not None and made is not None and DRAFT_NAME.match(made.draft):
+            name = made.draft or file
+            try:
+                return Draft(shard, file, size, shared.opened(name, size, os.O_RDWR))
+            except OSError as error:
+                # Most likely the folder is read-only here.
+                with self._mutex:
+                    shared.ahead.unusable(size)
+                _log.info("payload %s of shard %s: %s", file, shard, error)
+        self._count("payload_fallbacks")
+        if isinstance(answer, Staged):
             self.drop(shard, file)
-            return None
+        return None
 
     def nameless(self, shard: str, size: int) -> tuple[Draft, memoryview, memoryview] | None:
         """Make memory to be filled in place and passed to a shard in this process without a copy.
@@ -347,7 +373,7 @@ class SharedPayloads:
         pages = self._mapped.get(key)
         if pages is None or pages.size != size:
             try:
-                descriptor = self._opened(shared, file, size, os.O_RDONLY)
+                descriptor = shared.opened(file, size, os.O_RDONLY)
                 try:
                     pages = map_file(descriptor, size, writable=False)
                 finally:
@@ -358,24 +384,6 @@ class SharedPayloads:
                 return None
             self._mapped[key] = pages
         return body_of(pages).toreadonly()
-
-    @staticmethod
-    def _opened(shared: _Shared, file: str, size: int, access: int) -> int:
-        """Open a payload, verified to be a file of the shard.
-
-        Raises:
-            OSError: It is not one.
-        """
-        assert shared.folder is not None
-        flags = access | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-        descriptor = os.open(file, flags, dir_fd=shared.folder.files)
-        found = os.fstat(descriptor)
-        # If it were shorter than announced, touching the missing part would kill the process.
-        fits = stat.S_ISREG(found.st_mode) and found.st_size == size
-        if not fits or found.st_uid != shared.folder.owner:
-            os.close(descriptor)
-            raise OSError(f"user {found.st_uid}, {stat.filemode(found.st_mode)}, {found.st_size}")
-        return descriptor
 
     def close(self) -> None:
         """Close all folders; mapped payloads stay."""

@@ -49,6 +49,7 @@ from enact_dist.link.memory.drafts import (
 from enact_dist.link.memory.maps import Pages, PlainMemory, body_of, leftovers, plain_memory
 from enact_dist.link.memory.names import UsedNames
 from enact_dist.link.memory.payload_files import PayloadFiles
+from enact_dist.link.memory.shared_folder import SharedFolder
 from enact_dist.wire.limits import BODY_BYTES_MAX, PAYLOAD_BYTES_MIN, PAYLOAD_NAME
 
 if TYPE_CHECKING:
@@ -56,7 +57,6 @@ if TYPE_CHECKING:
 
     from enact_dist.core.protocol.datum import Datum
     from enact_dist.core.protocol.messages import Commit, Prepare, Stage
-    from enact_dist.link.memory.shared_folder import SharedFolder
 
     _Written = TypeVar("_Written", Commit, Prepare)
 
@@ -80,7 +80,7 @@ class PayloadDesk:
     """The payloads of one shard.  Thread-safe; never waits for the shard.
 
     Args:
-        folder: Where clients of this host find them; None: they stay in this process.
+        folder: Where clients of this host find them, or its files; None: they stay in this process.
         bytes_max: Byte limit of the files, drafts included; without a folder, of the drafts.
         firm: Whether a payload beyond the limit is refused; otherwise it goes to plain memory.
         make_room: Called to remove history until so many bytes are free.
@@ -93,7 +93,7 @@ class PayloadDesk:
 
     def __init__(
         self,
-        folder: SharedFolder | None,
+        folder: SharedFolder | PayloadFiles | None,
         bytes_max: int,
         *,
         firm: bool = True,
@@ -102,7 +102,7 @@ class PayloadDesk:
         clock: Clock | None = None,
     ) -> None:
         self.counters: dict[str, int] = {}
-        self._disk = None if folder is None else PayloadFiles(folder)
+        self._disk = PayloadFiles(folder) if isinstance(folder, SharedFolder) else folder
         self._bytes_max = bytes_max
         self._firm = firm
         self._draft_bytes_max = bytes_max if folder is None else DRAFT_BYTES_MAX
@@ -268,7 +268,7 @@ class PayloadDesk:
             elif self._firm:
                 return self._refused(session, total, self._bytes, self._bytes_max)
             else:
-                self._travels(f"its limit of {self._bytes_max} bytes is reached", self._disk.folder)
+                self._travels(f"its limit of {self._bytes_max} bytes is reached", self._disk)
         if memory is None:
             with self._mutex:
                 drafted = plain_bytes(self._drafts)
@@ -356,7 +356,7 @@ class PayloadDesk:
             more = not again and (self._gave_back(total) or code == EEXIST)
             if not (more and leftovers().wait(ROOM_S) and self._reserved(total)):
                 break
-        self._travels(why, disk.folder)
+        self._travels(why, disk)
         return None
 
     def _filed(self, disk: PayloadFiles, file: str, total: int) -> Pages:
@@ -368,14 +368,14 @@ class PayloadDesk:
                 self._files -= 1
             raise
 
-    def _travels(self, why: str, folder: SharedFolder) -> None:
+    def _travels(self, why: str, disk: PayloadFiles) -> None:
         """Count a payload outside the folder, and log it; a full folder is logged less often."""
         self._count("payload_fallbacks")
         now_ns = self._clock.monotonic_ns()
         if now_ns >= self._silent_until_ns:
             self._silent_until_ns = now_ns + SILENT_NS
             text = "large data go over the network because the shared folder %s takes none: %s"
-            _log.warning(text, folder.path, why)
+            _log.warning(text, disk.path, why)
 
     def drop(self, file: str) -> None:
         """Drop a draft, if it exists."""

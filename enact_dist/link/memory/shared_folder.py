@@ -296,6 +296,30 @@ class OpenedFolder:
         """Return a path at which a socket called `name` in this folder can be reached."""
         return address_in(self.descriptor, self.path, name)
 
+    def opened(self, file: str, size: int, access: int) -> int:
+        """Open a payload of so many bytes, verified to be a file of the shard.
+
+        Args:
+            file: Its name.
+            size: Its length in bytes.
+            access: `os.O_RDWR` or `os.O_RDONLY`.
+
+        Returns:
+            A descriptor, which the caller closes.
+
+        Raises:
+            OSError: It is not one.
+        """
+        flags = access | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+        descriptor = os.open(file, flags, dir_fd=self.files)
+        found = os.fstat(descriptor)
+        # If it were shorter than announced, touching the missing part would kill the process.
+        fits = stat.S_ISREG(found.st_mode) and found.st_size == size
+        if not fits or found.st_uid != self.owner:
+            os.close(descriptor)
+            raise OSError(f"user {found.st_uid}, {stat.filemode(found.st_mode)}, {found.st_size}")
+        return descriptor
+
     def close(self) -> None:
         """Close the descriptors; files opened and sockets connected through them stay open."""
         for descriptor in {self.descriptor, self.files} - {-1}:

@@ -19,6 +19,7 @@ from enact_dist.verify.simulation import cells
 from enact_dist.verify.simulation import faults as fault_options
 from enact_dist.verify.simulation.cells import CONTEXTS, WORK_NS
 from enact_dist.verify.simulation.hosts.client_host import ClientNode
+from enact_dist.verify.simulation.hosts.folders import SHARE, Folders
 from enact_dist.verify.simulation.hosts.network import Network
 from enact_dist.verify.simulation.hosts.payloads import DRAFT_NS
 from enact_dist.verify.simulation.hosts.shard_host import ShardNode
@@ -95,9 +96,16 @@ class Scenario:
         self.model = Model(world, self.history, ASPECTS)
         self.network = Network(world, cell.faults, through_wire=through_wire)
         self.shards = self._made_shards(cell.shards)
-        self.workload = Workload(world, self.history, self.model, entities=cell.entities)
+        self.folders = Folders(world, share=SHARE)
+        self.workload = Workload(
+            world,
+            self.history,
+            self.model,
+            entities=cell.entities,
+            folders=self.folders.takes_place,
+        )
         for host in self.shards.values():
-            host.asserts = asserts
+            host.asserts, host.folders = asserts, self.folders
             host.keeps, host.between = self.workload.keepers.takes_place, self._between
         self._steps = self.schedule.place("steps")
         self.forker = Forker(world, self.model, self.workload)
@@ -138,6 +146,7 @@ class Scenario:
             faults=self.cell.faults,
             ttl_ns=self.cell.ttl_ns,
             sight=self.workload.keepers.sight(number),
+            folders=self.folders,
         )
         host.kept.looked = self.model.keeping.looked
         host.kept.stands = partial(self.injector.at_step, host)

@@ -27,6 +27,7 @@ from enact_dist.core.protocol.messages import (
     Welcome,
 )
 from enact_dist.link.client.catalogue import CATALOGUES, KnownCatalogue
+from enact_dist.verify.simulation.hosts.folders import ClientFiles, Folders
 from enact_dist.verify.simulation.hosts.keeping import KeptLocks, Sight, Stop
 from enact_dist.verify.simulation.hosts.world import MS, Host, S
 
@@ -87,6 +88,7 @@ class ClientNode(Host):
         faults: Faults,
         ttl_ns: int,
         sight: Sight = Sight.AWAY,
+        folders: Folders | None = None,
     ) -> None:
         super().__init__(world, name, drift_ppm=faults.drift_ppm, wall_offset_ns=0)
         session = f"{world.schedule.stream(f'session of {name}').getrandbits(64):016x}"
@@ -94,6 +96,7 @@ class ClientNode(Host):
         self.catalogue = KnownCatalogue()
         self.generation = 0
         self.starves_until_ns = 0
+        self.files = ClientFiles(self, folders or Folders(world))
         self.cache: dict[Slot, tuple[str, int, int, Datum]] = {}
         self.own: dict[Slot, tuple[str, int, int]] = {}
         """Where and in which epoch it last committed a slot, and with which stamp."""
@@ -276,6 +279,7 @@ class ClientNode(Host):
         """Take the catalogue that an answer carries, as `link.client.session` does."""
         if isinstance(answer, Welcome):
             self.kept.learn(shard, answer.epoch)
+            self.files.payloads.learn(answer)
         if isinstance(answer, CATALOGUES):
             self.catalogue.learn(shard, answer, sent_in=sent_in)
             self.client.knows_types(shard, self.catalogue.successions(shard))
@@ -309,4 +313,5 @@ class ClientNode(Host):
         self._calls.clear()
         self._stopped.clear()
         self.kept.vanish()
+        self.files.vanish()
         self.threads_left = 0

@@ -1,34 +1,46 @@
 """Large data that travel apart from their commits, on a bad network: both ends, and their judge.
 
-Each simulated shard has a real `PayloadDesk` in plain memory, new with each start.  Clients bring
+Each simulated shard has a real `PayloadDesk`, new with each start.  In some runs it has a folder,
+in which clients fill files (`hosts.folders`); otherwise it keeps plain memory.  Clients bring
 some of their large data in slices, which are lost, doubled, late and cut off by crashes; some name
 a payload of which only a part has come, or nothing.  Whatever happens, a commit has all of its
 bytes, and a payload is gone as soon as nothing of its shard shows it any more.  A draft ends with
 its session, or, where the session holds no lock, after 30 s of its shard without a slice.
+
+Of a folder: what a commit publishes is what its client has written, and stays that; every file
+belongs to a draft or to data that somebody shows; what the desk counts is what is there.
 """
 
 from __future__ import annotations
 
 import weakref
 from dataclasses import replace
+from functools import partial
+from random import Random
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.datum import Datum
 from enact_dist.core.protocol.messages import Commit, EpochChanged, Prepare, Stage, Staged
 from enact_dist.core.protocol.records import Persist, PreparedRecord, SlotRecord
-from enact_dist.link.memory.maps import PlainMemory
+from enact_dist.link.memory.maps import Pages, PlainMemory, leftovers
 from enact_dist.link.memory.payload_desk import PayloadDesk
-from enact_dist.verify.simulation.hosts.world import Host, S
+from enact_dist.verify.simulation.hosts.world import MS, Host, S
+from enact_dist.wire.limits import PAYLOAD_BYTES_MIN
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
 
     from enact_dist.core.protocol.messages import Answer, Request, WriteItem
     from enact_dist.core.protocol.records import Effect
     from enact_dist.core.shard.shard import Shard
     from enact_dist.core.state.tenure import Tenure
+    from enact_dist.verify.simulation.hosts.folders import Folder, Folders
 
 BYTES_MAX: Final = 64 << 20
+OTHER: Final = "f" * 16
+"""A session of which nothing else is simulated."""
+NEEDS_NS: Final = tuple(ms * MS for ms in (0, 1, 5, 30, 200))
+"""How long after files were made ahead somebody else needs their room."""
 DRAFT_NS: Final = 30 * S
 """A draft of a session without a lock ends when it has had no slice for longer."""
 
@@ -51,11 +63,21 @@ class HostClock:
 class ShardPayloads:
     """The payloads of one life of a shard, and who may still hold them."""
 
-    def __init__(self, host: Host, shard: Shard, is_unused: Callable[[Tenure], bool]) -> None:
+    def __init__(
+        self,
+        host: Host,
+        shard: Shard,
+        is_unused: Callable[[Tenure], bool],
+        folders: Folders,
+        folder: Folder | None,
+    ) -> None:
         self._world, self._shard, self._host = host.world, shard, host
         self._is_unused = is_unused
-        self.desk = PayloadDesk(None, BYTES_MAX, clock=HostClock(host))
-        self._adopted: dict[str, weakref.ref[PlainMemory]] = {}
+        self._written, self._folder, self._folders = folders.written, folder, folders
+        self._needs = self._world.schedule.place(f"{host.name}-room")
+        bytes_max = BYTES_MAX if folder is None else folders.bytes_max
+        self.desk = PayloadDesk(folder, bytes_max, firm=folders.firm, clock=HostClock(host))
+        self._adopted: dict[str, weakref.ref[Pages | PlainMemory]] = {}
         self._drafts: dict[str, tuple[str, int, int]] = {}
         """Of each draft its session, its first and its newest slice, by the shard's clock."""
 
@@ -66,7 +88,9 @@ class ShardPayloads:
         self._world.tally["slices staged"] += 1
         answer = self.desk.stage(message)
         file, now_ns = message.file, self._host.local_ns
-        if file not in self._adopted and isinstance(answer, Staged):
+        if not message.total:
+            self._world.tally["drafts dropped"] += self._drafts.pop(file, None) is not None
+        elif isinstance(answer, Staged) and file in self.desk.drafts():
             _, begun_ns, _ = self._drafts.get(file, ("", now_ns, now_ns))
             self._drafts[file] = message.session, begun_ns, now_ns
         return answer
@@ -90,10 +114,41 @@ class ShardPayloads:
             again = known is not None and known() is memory
             self._world.tally["payloads adopted again" if again else "payloads adopted"] += 1
             self._adopted[before.datum.file] = weakref.ref(memory)
+            self._check_written(before.datum.file, after.datum)
             _, begun_ns, _ = self._drafts.pop(before.datum.file, ("", self._host.local_ns, 0))
             late = self._host.local_ns - begun_ns > DRAFT_NS
             self._world.tally["payloads adopted after a long time"] += late
         return found
+
+    def _check_written(self, file: str, datum: Datum | None) -> None:
+        written = self._written.get(file)
+        if written is not None and (datum is None or datum.body != written):
+            self._world.violation("a commit publishes what its client wrote", file)
+
+    def make_ahead(self) -> None:
+        """Make files that clients will ask for, as the shard's link does after an answer."""
+        if self._folder is not None:
+            self._folder.ahead = True
+            self.desk.make_ahead()
+            self._folder.ahead = False
+            bits, fault = self._needs.next(), self._needs.fault
+            needed = (bits & 0xFFFF) < self._folders.needed * 0x10000
+            if needed and self._world.schedule.allows(fault):
+                luck = Random(bits)
+                delay_ns = luck.choice(NEEDS_NS)
+                self._host.later(delay_ns, partial(self._need_room, fault, luck))
+
+    def _need_room(self, fault: str, luck: Random) -> None:
+        """Let somebody else ask for room that files ahead have, and give it up at once."""
+        figures, size = self.desk.figures(), PAYLOAD_BYTES_MIN + 1
+        if figures["files_ahead"]:
+            files = luck.randint(1, figures["files_ahead"])
+            total = figures["payload_bytes_max"] - figures["payload_bytes"] + files * size
+            self._world.befell(fault, f"{files} files ahead of {self._host.name} make room")
+            file = f"{OTHER}-{fault.rpartition('.')[2]}"
+            self.desk.stage(Stage(OTHER, file, 0, total, Datum(b"", b"", 0)))
+            self.desk.drop(file)
+            leftovers().wait(60.0)  # a large file is freed by a thread
 
     def look(self) -> None:
         """Give up drafts as the shard's link does at each tick: those that must end, no others."""
@@ -116,10 +171,40 @@ class ShardPayloads:
                 self._world.tally["drafts given up for want of slices"] += 1
             if over and file in left:
                 self._world.violation(over, file)
-            if not over and file not in left:
+            if not over and file not in left and not self.desk.counters.get("drafts_displaced"):
                 self._world.violation("a draft stays while its client may commit it", file)
-            if over:
+            if over or file not in left:
                 del self._drafts[file]
+        for file, session in left.items():
+            if session not in sessions:
+                self._world.violation("drafts end with their session", file)
+        self._check_folder(left)
+
+    def _check_folder(self, drafts: Iterable[str]) -> None:
+        """A folder has the files that somebody may still use, and as many as are counted."""
+        if self._folder is None:
+            return
+        names, figures = self._folder.names(), self.desk.figures()
+        held = {file for file, adopted in self._adopted.items() if adopted() is not None}
+        if not names <= held.union(drafts):
+            self._world.violation("no file is left", names.difference(held, drafts))
+        sizes = self._folder.sizes()
+        if (figures["payload_files"], figures["payload_bytes"]) != (len(sizes), sum(sizes)):
+            self._world.violation("what is counted is there", figures, sizes)
+
+    def end(self) -> None:
+        """End with the process, of which nobody closes anything."""
+        figures = self.desk.figures()
+        self.tally_counters()
+        self._world.tally["files ahead at a crash"] += figures["files_ahead"]
+        if self._folder is not None:
+            self._folder.abandon()
+        self.desk.sweep(lambda _: False, lambda _: False)  # as the kernel takes its memory
+
+    def tally_counters(self) -> None:
+        """Add the counters of the desk to the tally of the run."""
+        for name, count in self.desk.counters.items():
+            self._world.tally[f"desk: {name}"] += count
 
     def _holders(self) -> set[str]:
         """Return the sessions with a lock, other than kept grants that they do not use."""
@@ -130,7 +215,13 @@ class ShardPayloads:
 
     def check_released(self) -> None:
         """When nothing is under way, a payload lives as long as a slot or a reader shows it."""
-        held = {id(_memory_of(datum)) for datum in _shown(self._shard)}
+        held = set()
+        for datum in _shown(self._shard):
+            held.add(id(_memory_of(datum)))
+            if datum is not None and datum.file:
+                self._check_written(datum.file, datum)
+        self.desk.sweep(lambda _: False, lambda _: False)
+        self._check_folder(())
         for file, adopted in self._adopted.items():
             memory = adopted()
             if memory is None:
@@ -149,9 +240,9 @@ def _as_in_a_frame(write: WriteItem) -> WriteItem:
     return write._replace(datum=replace(datum, body=b""))
 
 
-def _memory_of(datum: Datum | None) -> PlainMemory | None:
+def _memory_of(datum: Datum | None) -> Pages | PlainMemory | None:
     body = None if datum is None else datum.body
-    if isinstance(body, memoryview) and isinstance(body.obj, PlainMemory):
+    if isinstance(body, memoryview) and isinstance(body.obj, Pages | PlainMemory):
         return body.obj
     return None
 

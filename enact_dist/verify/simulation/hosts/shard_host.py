@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Protocol, cast
 
@@ -17,6 +18,7 @@ from enact_dist.core.protocol.records import (
 )
 from enact_dist.core.shard.shard import Shard
 from enact_dist.verify.simulation.hosts.disk import Disk
+from enact_dist.verify.simulation.hosts.folders import NO_NONCE, Folders
 from enact_dist.verify.simulation.hosts.keeping import SimulatedMarks, SimulatedPage
 from enact_dist.verify.simulation.hosts.payloads import ShardPayloads, as_kept
 from enact_dist.verify.simulation.hosts.world import MS, Host, S
@@ -35,6 +37,8 @@ if TYPE_CHECKING:
 
 ASSERT_EVERY = 4
 """Steps between two looks at the shard's own assertions; the judge looks at each step."""
+AHEAD_NS = (0, 0, MS // 10, MS, 40 * MS)
+"""How long after an answer a shard makes files ahead."""
 
 
 class ShardJudge(Protocol):
@@ -79,6 +83,7 @@ class ShardNode(ShardPlace):
         self.judge: ShardJudge
         self.shard: Shard
         self.payloads: ShardPayloads
+        self.folders = Folders(world)
         self.keeps = False
         self.between: Callable[[str], None] = lambda _session: None
         self.tokens: Callable[[ShardNode], list[str]] = lambda _host: []
@@ -88,6 +93,7 @@ class ShardNode(ShardPlace):
         self.peers: Mapping[str, ShardPlace] = {}
         self.asked: dict[int, Request] = {}
         self._replies: dict[int, Callable[[Answer], None]] = {}
+        self._ahead = world.schedule.stream(f"{settings.name} makes ahead")
         self._handle = self._steps = 0
         self._stalled = self._deciding = False
         self._inbox: list[tuple[Request | Event, int]] = []
@@ -106,8 +112,12 @@ class ShardNode(ShardPlace):
         """Serve what a store held when it was opened."""
         self._replies.clear()
         self.asked.clear()
-        self.shard = Shard(self.settings, recovered, now_ns=self.local_ns, wall_ns=self.wall_ns)
-        self.payloads = ShardPayloads(self, self.shard, self.is_unused)
+        settings, folder = self.settings, None
+        if self.folders.takes_place:
+            folder = self.folders.made_for(self.name, self.between)
+            settings = replace(settings, shared=folder.name, shared_nonce=NO_NONCE)
+        self.shard = Shard(settings, recovered, now_ns=self.local_ns, wall_ns=self.wall_ns)
+        self.payloads = ShardPayloads(self, self.shard, self.is_unused, self.folders, folder)
         if self.keeps:
             if self.marks is not None:
                 self.marks.sweep()
@@ -129,8 +139,11 @@ class ShardNode(ShardPlace):
         self.world.tally["power cuts" if power_cut else "crashes"] += 1
         self.end_life()
         self._stalled = False
-        if power_cut and self.marks is not None:
-            self.marks.sweep()
+        self.payloads.end()
+        if power_cut:
+            self.folders.remove(self.name)
+            if self.marks is not None:
+                self.marks.sweep()
         self._inbox.clear()
         self._crashed_at_ns = self.world.now_ns
         self._tally_counters()
@@ -183,6 +196,7 @@ class ShardNode(ShardPlace):
     def close(self) -> None:
         """Add this shard's own statistics to those of the run."""
         self._tally_counters()
+        self.payloads.tally_counters()
 
     # ---------------------------------------------------------------- messages in, effects out
 
@@ -190,10 +204,17 @@ class ShardNode(ShardPlace):
         """Hand a request to the shard; exactly one answer must come, now or later."""
         if isinstance(message, Stage):
             reply(self.payloads.stage(message))
+            self._make_ahead()
             return
         self._handle += 1
         self._replies[self._handle], self.asked[self._handle] = reply, message
         self._give(self.payloads.with_bodies(message), self._handle)
+        self._make_ahead()
+
+    def _make_ahead(self) -> None:
+        """Make the files that are wanted ahead, in a moment: clients meet none, some or all."""
+        if self.payloads.desk.wants_ahead:
+            self.later(self._ahead.choice(AHEAD_NS), self.payloads.make_ahead)
 
     def event(self, event: Event) -> None:
         """Hand an event of this host to the shard."""

@@ -112,10 +112,16 @@ class Workload:
     """Draws jobs and does them."""
 
     def __init__(
-        self, world: SimulatedWorld, history: RunHistory, model: Model, *, entities: int
+        self,
+        world: SimulatedWorld,
+        history: RunHistory,
+        model: Model,
+        *,
+        entities: int,
+        folders: bool = False,
     ) -> None:
         self._world, self._history, self._model = world, history, model
-        self._stager = Stager(world)
+        self._stager = Stager(world, folders=folders)
         self._captures = Captures(world, model)
         self.growth = Growth(world, model, ASPECTS)
         self._entities = ENTITIES[:entities]
@@ -259,7 +265,7 @@ class Workload:
         while not self._world.winding_down:
             yield Sleep(random.choice((0, 5 * MS, 30 * MS, 150 * MS)))
             luck = Random(random.getrandbits(64))
-            items, times = self.keepers.repeats(luck)
+            items, times = self._stager.burst(host, lane, luck) or self.keepers.repeats(luck)
             for again in range(times):
                 job = self.job(f"{host.name}/{lane}.{number}", luck)
                 if items:
@@ -339,6 +345,7 @@ class Workload:
             elif lock.phase is Phase.HELD:
                 yield from self._finish(host, entry, job, data)
             yield from host.drive(lock)
+        self._stager.ended(host, lock)
         yield from self.keepers.asked_later(host, entry, job.luck)
         self._history.end(entry, now_ns=self._world.now_ns)
         self._world.tell(job.name, "ends as", entry.told.value if entry.told else "-", lock.cause)
@@ -387,7 +394,9 @@ class Workload:
         return data
 
     def _fetched(self, host: ClientNode, lock: MultiLock, reading: Reading) -> Steps[Datum | None]:
-        state = reading.state
+        state, mapped = reading.state, host.files.mapped(reading)
+        if mapped is not None:
+            return mapped
         request = Fetch(lock.lock, reading.epoch, state.slot, state.version, 0, 1 << 20)
         for _ in range(5):
             (answer,) = yield ParallelCalls([(reading.shard, request)])
@@ -467,7 +476,8 @@ class Workload:
             return None
         old = data.get(slot)
         value = 1 if old is None else value_of(old) + 1
-        large = job.rests_ns or (slot.aspect == "frame" and random.random() < 0.2)
+        share = self._stager.large.get(slot.aspect)
+        large = job.rests_ns or (share is not None and random.random() < share)
         datum = datum_of(f"{lock.lock}|{value}", size=LARGE if large else 0)
         encoding = self.growth.encoding(entry.newer, slot)
         stamp_ns = drawn_stamp_ns(random, self._world.now_ns)
