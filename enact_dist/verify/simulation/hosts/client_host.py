@@ -96,7 +96,12 @@ class ClientNode(Host):
         self.catalogue = KnownCatalogue()
         self.generation = 0
         self.starves_until_ns = 0
-        self.files = ClientFiles(self, folders or Folders(world))
+        self.files = ClientFiles(
+            self,
+            session,
+            lambda shard, message: self.call(shard, message, lambda _answer: None),
+            folders or Folders(world),
+        )
         self.cache: dict[Slot, tuple[str, int, int, Datum]] = {}
         self.own: dict[Slot, tuple[str, int, int]] = {}
         """Where and in which epoch it last committed a slot, and with which stamp."""

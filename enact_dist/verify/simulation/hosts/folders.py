@@ -34,8 +34,7 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.datum import Datum
     from enact_dist.core.protocol.messages import Answer, Request
     from enact_dist.link.memory.maps import Pages
-    from enact_dist.verify.simulation.hosts.client_host import ClientNode
-    from enact_dist.verify.simulation.hosts.world import SimulatedWorld
+    from enact_dist.verify.simulation.hosts.world import Host, SimulatedWorld
 
 SHARE: Final = 0.25
 """Share of the runs whose shards have a folder."""
@@ -58,7 +57,7 @@ class Folders:
         takes_place: Whether the shards of this run have folders.
         firm: Whether a payload beyond the room is refused; otherwise it goes to plain memory.
         full: Share of the files for which others leave no room in the file system.
-        needed: How often somebody needs the room of files that were made ahead.
+        needed: How often another client needs the room of files that were made ahead.
         written: Of each file the bytes that its client writes.
         pending: The files that a living client fills, or may still commit.
     """
@@ -182,7 +181,7 @@ class Folder(PayloadFiles):
     # ---------------------------------------------------------------- a client's side
 
     def opened(self, file: str, size: int, access: int) -> int:
-        """Return a descriptor; whoever opens a file to write is the only one that ever does."""
+        """Return a descriptor; a file is opened for writing once, by one client."""
         if file not in self._files:
             raise OSError(errno.ENOENT, os.strerror(errno.ENOENT))
         if access == os.O_RDWR:
@@ -217,24 +216,29 @@ class SeenFolder(OpenedFolder):
 class ClientFiles:
     """The payloads of all shards as one client process sees them.
 
+    Args:
+        host: The process.
+        session: Its session.
+        say: Sends a request to a shard without waiting for the answer.
+        folders: Those of the run.
+
     Attributes:
         payloads: The real client's side.
     """
 
-    def __init__(self, host: ClientNode, folders: Folders) -> None:
-        self._host, self._folders = host, folders
+    def __init__(
+        self, host: Host, session: str, say: Callable[[str, Request], None], folders: Folders
+    ) -> None:
+        self._session, self._folders = session, folders
         self._sees = folders.world.schedule.stream(f"what {host.name} sees").random() < SEEN
         self.payloads = SharedPayloads(
-            host.client.session,
-            self._say,
+            session,
+            say,
             self._count,
             open_folder=self._seen,
             now_s=lambda: host.local_ns / 1e9,
         )
         self._open: set[Draft] = set()
-
-    def _say(self, shard: str, request: Request) -> None:
-        self._host.call(shard, request, lambda _answer: None)
 
     def _count(self, name: str) -> None:
         self._folders.world.tally[f"client: {name}"] += 1
@@ -303,8 +307,6 @@ class ClientFiles:
         for draft in self._open:
             draft.close()
         self._open.clear()
-        mine = {
-            file for file in self._folders.pending if file.startswith(self._host.client.session)
-        }
+        mine = {file for file in self._folders.pending if file.startswith(self._session)}
         self._folders.pending -= mine
         self.payloads.close()

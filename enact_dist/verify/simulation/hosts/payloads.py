@@ -8,7 +8,7 @@ bytes, and a payload is gone as soon as nothing of its shard shows it any more. 
 its session, or, where the session holds no lock, after 30 s of its shard without a slice.
 
 Of a folder: what a commit publishes is what its client has written, and stays that; every file
-belongs to a draft or to data that somebody shows; what the desk counts is what is there.
+belongs to a draft or to data that are still shown; what the desk counts is what is there.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ BYTES_MAX: Final = 64 << 20
 OTHER: Final = "f" * 16
 """A session of which nothing else is simulated."""
 NEEDS_NS: Final = tuple(ms * MS for ms in (0, 1, 5, 30, 200))
-"""How long after files were made ahead somebody else needs their room."""
+"""How long after files were made ahead another client needs their room."""
 DRAFT_NS: Final = 30 * S
 """A draft of a session without a lock ends when it has had no slice for longer."""
 
@@ -139,7 +139,7 @@ class ShardPayloads:
                 self._host.later(delay_ns, partial(self._need_room, fault, luck))
 
     def _need_room(self, fault: str, luck: Random) -> None:
-        """Let somebody else ask for room that files ahead have, and give it up at once."""
+        """Let another client ask for room that files ahead have, and give it up at once."""
         figures, size = self.desk.figures(), PAYLOAD_BYTES_MIN + 1
         if figures["files_ahead"]:
             files = luck.randint(1, figures["files_ahead"])
@@ -181,7 +181,7 @@ class ShardPayloads:
         self._check_folder(left)
 
     def _check_folder(self, drafts: Iterable[str]) -> None:
-        """A folder has the files that somebody may still use, and as many as are counted."""
+        """A folder has the files that may still be used, and as many as are counted."""
         if self._folder is None:
             return
         names, figures = self._folder.names(), self.desk.figures()
@@ -193,7 +193,7 @@ class ShardPayloads:
             self._world.violation("what is counted is there", figures, sizes)
 
     def end(self) -> None:
-        """End with the process, of which nobody closes anything."""
+        """End with the process, which closes nothing."""
         figures = self.desk.figures()
         self.tally_counters()
         self._world.tally["files ahead at a crash"] += figures["files_ahead"]
