@@ -360,7 +360,7 @@ def test_numbers_have_the_history_of_their_datum(cell):
         with Lock(speed) as lock:
             lock[speed] = value
     samples = Samples()
-    samples.learn(CellSource(cell), SPEED_SLOT)
+    samples.learn(SPEED_SLOT, CellSource(cell).samples(SPEED_SLOT, 120, 4096))
     assert [numbers[""] for _, numbers in samples.of(SPEED_SLOT)] == [0.5, 1.0, 2.0]
     samples.only(set())
     assert samples.of(SPEED_SLOT) == []

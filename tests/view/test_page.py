@@ -1,6 +1,7 @@
 """A page and its server, without a browser: its thread, its bounds, its moments."""
 
 import socket
+import threading
 import time
 from types import SimpleNamespace
 
@@ -78,6 +79,29 @@ def test_rows_are_shown_again_as_soon_as_their_values_come(page, monkeypatch):
     page._send("filter", "speed")
     handles = page._client.gui.handles
     until(lambda: any("<b>arm/speed</b> 0.5" in str(h.content) for h in [*handles.values()]))
+
+
+def test_a_page_goes_on_while_a_history_is_read(page, monkeypatch):
+    """A second choice meanwhile follows; what cannot be read is told."""
+    asked, read = [], threading.Event()
+
+    def samples(slot, *_):
+        asked.append(slot.aspect)
+        assert read.wait(60)
+        raise ConfigError("the file is gone")
+
+    monkeypatch.setattr(page._viewer.source, "samples", samples)
+    page.start()
+    handles = page._client.gui.handles
+    until(lambda: "datum" in handles and "arm/pose" in handles["datum"].options)
+    page._send("datum", "arm/pose")
+    until(lambda: asked == ["pose"])
+    page._send("datum", "arm/speed")
+    until(lambda: any("<b>online:arm/speed</b>" in str(h.content) for h in [*handles.values()]))
+    assert asked == ["pose"]
+    read.set()
+    until(lambda: asked == ["pose", "speed"])
+    until(lambda: "the file is gone" in page._client.status())
 
 
 def test_the_slider_reaches_from_the_oldest_moment_to_the_present(page, cell):

@@ -13,10 +13,10 @@ from enact_dist.view.drawing.files import ply_of, png_of
 from enact_dist.wire.payload import decode_untyped
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterable, Mapping
 
     from enact_dist.config.shows import Shows
-    from enact_dist.core.protocol.datum import Slot
+    from enact_dist.core.protocol.datum import Datum, Slot
     from enact_dist.view.drawing.scene import ShownDatum
     from enact_dist.view.source import CellSource, DataSource
     from enact_dist.world.lineage import CauseTree, EffectTree, Made
@@ -59,13 +59,8 @@ class Samples:
         for slot in self._known.keys() - slots:
             del self._known[slot]
 
-    def learn(self, source: DataSource, slot: Slot) -> None:
-        """Take the history of a slot.
-
-        Raises:
-            EnactError: Its shard does not answer, or the recording cannot be read.
-        """
-        learned = source.samples(slot, markup.SAMPLES_MAX, SMALL_BYTES)
+    def learn(self, slot: Slot, learned: Iterable[tuple[int, Datum]]) -> None:
+        """Take the history of a slot, see `DataSource.samples`."""
         newer = list(self._known.pop(slot, ()))
         for stamp_ns, datum in learned:
             self._add(slot, stamp_ns, decode_untyped(datum))

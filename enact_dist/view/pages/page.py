@@ -8,6 +8,7 @@ import queue
 import threading
 import time
 from collections import deque
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.view import markup
@@ -64,6 +65,7 @@ class Page:
         self._drawable: list[Slot] = []
         self._listed_s = self._ticked_s = 0.0
         self._lacking: list[Slot] = []
+        self._learning = False
         self._fits = 2
         self._begun_s = self._acted_s = time.monotonic()
         self._draws: deque[float] = deque()
@@ -317,7 +319,30 @@ class Page:
             self._send("history", self._datum)  # after the datum itself is shown
 
     def _on_history(self, slot: Slot) -> None:
-        self._samples.learn(self._viewer.source, slot)
+        """Ask for a history beside the page, one at a time: a recording is read through for it."""
+        if self._learning:
+            return  # the newest choice follows
+        self._learning = True
+        ask = partial(self._ask_history, slot)
+        threading.Thread(target=ask, name="view history", daemon=True).start()
+
+    def _ask_history(self, slot: Slot) -> None:
+        stand_back("view history")
+        found: object
+        try:
+            found = self._viewer.source.samples(slot, markup.SAMPLES_MAX, SMALL_BYTES)
+        except Exception as error:  # noqa: BLE001 - the page shows it
+            found = error
+        self._send("learned", (slot, found))
+
+    def _on_learned(self, answer: tuple[Slot, Any]) -> None:
+        slot, found = answer
+        self._learning = False
+        if self._datum not in (None, slot):
+            self._on_datum(markup.slot_name(self._datum))
+        if isinstance(found, Exception):
+            raise found
+        self._samples.learn(slot, found)
 
     def _on_layer(self, box: tuple[str, bool]) -> None:
         aspect, is_on = box
