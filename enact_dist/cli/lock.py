@@ -195,7 +195,7 @@ def _row(lock: LockInfo, known: dict[tuple[str, int], LockInfo]) -> tuple[object
         lock.modes,
         shown_s(lock.age_s),
         shown_s(lock.lease_left_s),
-        shown_s(lock.hold_left_s) if lock.granted else "-",
+        shown_s(lock.hold_left_s) if lock.granted and lock.hold_left_s is not None else "-",
         ", ".join(lock.slots),
         ", ".join(blockers) or "-",
     )

@@ -124,6 +124,8 @@ class LockInfo:
     Attributes:
         number: What `Cell.break_lock` takes; unique within the shard's epoch.
         modes: "read", "write" or both.
+        hold_left_s: None of a kept grant: each of its blocks has its `hold_s` from its begin on,
+            which its shard does not know.
         waits_for: Numbers of the locks that block it.
         kept: How a grant is used that stays with its session between two blocks: "unused" (it ends
             as soon as another lock asks for its data), "used", or "recalled" (used, and over with
@@ -140,7 +142,7 @@ class LockInfo:
     modes: str
     age_s: float
     lease_left_s: float
-    hold_left_s: float
+    hold_left_s: float | None
     slots: tuple[str, ...]
     waits_for: tuple[int, ...]
     kept: str = ""
@@ -376,7 +378,7 @@ def lock_info(shard: str, holder: Holder) -> LockInfo:
         holder.modes,
         holder.age_ns / 1e9,
         holder.lease_left_ns / 1e9,
-        holder.hold_left_ns / 1e9,
+        None if holder.kept else holder.hold_left_ns / 1e9,
         holder.slots,
         holder.waits_for,
         holder.kept,

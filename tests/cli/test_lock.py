@@ -75,7 +75,8 @@ def test_ls_shows_which_grants_are_kept_and_break_takes_them_away(at, cell):
             held[request] = held.get(request, 0) + 1
     line, lock = shown()
     assert " kept  " in line
-    assert (lock["kept"], lock["granted"]) == ("unused", True)
+    assert (lock["kept"], lock["granted"], lock["hold_left_s"]) == ("unused", True, None)
+    assert "  -  " in line
 
     broken = at("break", lock["number"], "--reason", "not needed")
     assert f"broke lock {lock['number']} on left, kept by painter@" in broken.out
