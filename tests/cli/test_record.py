@@ -1,14 +1,17 @@
 """`enact record` and `enact replay`: a running cell into a file and back, ends and errors."""
 
 import dataclasses
+import errno
 import json
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
+from enact_dist.cli.text import showing
 from enact_dist.recording.reading import Recording
 
 COUNT = Aspect("count", int)
@@ -200,6 +203,26 @@ def test_export_that_is_refused_leaves_no_folder(enact, cell_file, put, tmp_path
     words = ("world", "export", "refused", "--cell", cell_file, "--out", tmp_path / "folder")
     done = enact(*words, "--at", "9000000000000000000@left")
     assert done.status == 1
+    assert enact(*words).status == 0
+
+
+def test_export_that_fails_halfway_leaves_no_folder(enact, cell_file, put, tmp_path, monkeypatch):
+    """A full disk, say: what is there of it would look like the whole."""
+    put("halfway", a=1, b=2)
+    save, saved = showing.save, []
+
+    def full(value, path):
+        if saved:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        saved.append(path)
+        save(value, path)
+
+    words = ("world", "export", "halfway", "--cell", cell_file, "--out", tmp_path / "out" / "now")
+    with monkeypatch.context() as patched:
+        patched.setattr(showing, "save", full)
+        assert enact(*words).status == 1
+    assert Path(saved[0]).parent.parent == tmp_path / "out" / "now"
+    assert list((tmp_path / "out").iterdir()) == []
     assert enact(*words).status == 0
 
 

@@ -6,8 +6,8 @@ A folder holds for each datum `ENTITY/ASPECT.npy` (an array), `.json` (plain dat
 
 from __future__ import annotations
 
-import contextlib
 import json
+import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,7 @@ from enact_dist.cli.record import shows_of
 from enact_dist.cli.text.output import shown_bytes
 from enact_dist.cli.verbs import Output
 from enact_dist.config.table import path_of
-from enact_dist.errors import ConfigError, EnactError, ProtocolError
+from enact_dist.errors import ConfigError, ProtocolError
 from enact_dist.terms import checked_name
 
 if TYPE_CHECKING:
@@ -60,11 +60,10 @@ def _into_folder(world: WorldContext, folder: Path, at_ns: int) -> dict[str, obj
         ) from None
     try:
         index = [_save(version, folder) for version in world_as_of(world, at_ns)]
-    except EnactError:
-        with contextlib.suppress(OSError):  # of a folder that has data by now
-            folder.rmdir()
+        (folder / "index.json").write_text(json.dumps(index, indent=2), encoding="utf-8")
+    except BaseException:  # a part of an export is none, and would be in the way of the next one
+        shutil.rmtree(folder, ignore_errors=True)
         raise
-    (folder / "index.json").write_text(json.dumps(index, indent=2), encoding="utf-8")
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     return {"path": str(folder), "data": len(index), "size_bytes": size}
 
