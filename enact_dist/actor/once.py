@@ -350,8 +350,11 @@ class Once:
         requests = dict.fromkeys([outcome, *(request for request, _, _ in written)])
         refused, give_up_s = 0, float("inf")
         while True:
+            if stopping := self._stop.is_set():
+                give_up_s = min(give_up_s, time.monotonic() + OUTCOME_S)
+            wait_s = max(0.0, min(self._bound.actor.wait_s, give_up_s - time.monotonic()))
             try:
-                with Lock(*requests, wait_s=self._bound.actor.wait_s) as lock:
+                with Lock(*requests, wait_s=wait_s) as lock:
                     found = lock.get(outcome)
                     if found == taken:
                         lock[outcome] = ended
@@ -361,8 +364,6 @@ class Once:
                             else:
                                 lock.put(request, value, stamp_ns=stamp_ns)
             except REFUSALS as error:
-                if stopping := self._stop.is_set():
-                    give_up_s = min(give_up_s, time.monotonic() + OUTCOME_S)
                 if time.monotonic() >= give_up_s:
                     log.error(  # noqa: TRY400 (the error is the shard's, and named)
                         "%s: could not write the outcome of version %d for %r, which will read"

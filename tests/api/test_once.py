@@ -308,3 +308,32 @@ def test_outcome_that_waits_to_be_written_is_tried_at_once_when_the_actor_stops(
         thread.join(PATIENCE_S / 2)
 
     assert read(online, OUTCOME).state == "done"
+
+
+def test_actor_that_is_stopped_waits_for_its_outcome_no_longer_than_it_has_left(
+    cell, online, monkeypatch
+):
+    """Another program may hold the outcome for as long as the actor would wait otherwise."""
+    asked, begun, ends = [], threading.Event(), threading.Event()
+
+    class Asked(Lock):
+        def __init__(self, *requests, wait_s):
+            asked.append(wait_s)
+            super().__init__(*requests, wait_s=wait_s)
+
+    def moves(_):
+        begun.set()
+        assert ends.wait(PATIENCE_S)
+
+    monkeypatch.setattr(once, "Lock", Asked)
+    robot = Robot(moves)
+    robot.wait_s = 60.0
+    write(online, PLAN, [1])
+    with ActorThread(robot, cell) as thread:
+        assert begun.wait(PATIENCE_S)
+        thread.stop()
+        ends.set()
+        thread.join(PATIENCE_S)
+
+    assert read(online, OUTCOME).state == "done"
+    assert asked[-1] <= once.OUTCOME_S
