@@ -67,6 +67,16 @@ def test_tree_shows_aspects_below_their_entities(at):
     assert "camera" not in "".join(lines)
 
 
+@pytest.mark.parametrize(
+    ("pattern", "hint"), [("tray", "; tray/** matches "), ("camra", "; did you mean 'camera'?")]
+)
+def test_tree_of_nothing_names_what_there_is(at, pattern, hint):
+    (line,) = at("tree", "online", pattern).out.splitlines()
+    assert line.startswith("online: none of its ")
+    assert f"entities matches {pattern!r}{hint}" in line
+    assert at("tree", "online", pattern, "--json").json == []
+
+
 def test_tree_as_json_names_every_slot(at):
     """A program gets entity, aspect, version, size and shard."""
     slots = at("tree", "online", "camera", "--json").json

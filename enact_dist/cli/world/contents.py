@@ -8,11 +8,13 @@ from enact_dist.cli.text.output import shown_bytes
 from enact_dist.cli.text.slots import datum_output, named_if_missing, slots_output
 from enact_dist.cli.verbs import Output
 from enact_dist.cli.world.time import fork_facts, shown_origin
+from enact_dist.config.table import suggestion
 from enact_dist.terms import Entities, Entity
 from enact_dist.world.trees import shown_s
 
 if TYPE_CHECKING:
     import argparse
+    from collections.abc import Collection
 
     from enact_dist.world.cell import Cell
     from enact_dist.world.listings import AspectInfo
@@ -66,9 +68,21 @@ def _retained(info: AspectInfo) -> str:
 
 def show_tree(cell: Cell, options: argparse.Namespace) -> Output:
     """Show the entities of one world context as a tree, aspects as its leaves."""
-    found = cell.world(options.world).list_slots(Entities(options.pattern))
+    world = cell.world(options.world)
+    found = world.list_slots(Entities(options.pattern))
     infos = [info for info in found if options.null or not info.null_reason]
-    return slots_output(options.world, infos)
+    title = options.world
+    if not found:
+        known = {info.entity.name for info in world.list_slots()}
+        title += _near(options.pattern, known) if known else ""
+    return slots_output(title, infos)
+
+
+def _near(pattern: str, known: Collection[str]) -> str:
+    """Return that a pattern matches nothing, and what does or has a similar name."""
+    below = sum(name.startswith(f"{pattern}/") for name in known)
+    more = f"; {pattern}/** matches {below}" if below else suggestion(pattern, known)
+    return f": none of its {len(known)} entities matches {pattern!r}{more}"
 
 
 def get_datum(cell: Cell, options: argparse.Namespace) -> Output:
