@@ -42,12 +42,12 @@ from enact_dist.core.protocol.messages import (
 from enact_dist.core.protocol.records import (
     Compare,
     Drain,
+    LogEvent,
     MakeRoom,
     Persist,
     Persisted,
     Publish,
     Reply,
-    Story,
     Tick,
 )
 from enact_dist.core.shard import owners
@@ -58,7 +58,7 @@ from enact_dist.link.clock import Clock, SystemClock
 from enact_dist.link.host_figures import Stalls, figures_of, latencies_of
 from enact_dist.link.lease import AnswerGate
 from enact_dist.link.memory.drafts import half_of, names_payloads
-from enact_dist.link.memory.payload_desk import PayloadDesk
+from enact_dist.link.memory.payload_handler import PayloadHandler
 from enact_dist.link.memory.use_marks import mark_uses
 from enact_dist.link.signals import Uninterrupted
 
@@ -78,7 +78,7 @@ TICK_S_MAX: Final = 0.1
 TICK_S_MIN: Final = 0.001
 """Shortest pause of the timer; deadlines of many locks then share one tick."""
 _SOON_NS: Final = TICK_S_MAX * 1e9
-_TOLD_LATER: Final = (Publish, Story)  # a union would be rebuilt for each message
+_TOLD_LATER: Final = (Publish, LogEvent)  # a union would be rebuilt for each message
 PARKED_MAX: Final = 100_000
 """Requests that may be parked at one time."""
 JOIN_S: Final = 0.5
@@ -115,7 +115,7 @@ class ShardHost:
         mark_uses(shard.state.tenures.kept, shared)
         self._clock: Clock = clock or SystemClock()
         self._on_failure = on_failure
-        self.payloads = PayloadDesk(
+        self.payloads = PayloadHandler(
             shared,
             half_of(shared) if shared is None or payload_bytes_max is None else payload_bytes_max,
             firm=payload_bytes_max is not None,
@@ -343,7 +343,7 @@ class ShardHost:
     def _handle_now(
         self, message: Request | Event, handle: int, identity: str, subject: str | None
     ) -> None:
-        later: list[Publish | Story] = []
+        later: list[Publish | LogEvent] = []
         try:
             effects = self._shard.handle(
                 message,
@@ -387,7 +387,7 @@ class ShardHost:
         elif self._call is not None:
             self._call(effect.shard, cast("Request", effect.request))
 
-    def _tell(self, effect: Publish | Story) -> None:
+    def _tell(self, effect: Publish | LogEvent) -> None:
         """Tell watchers of a commit, or the log of an event."""
         if isinstance(effect, Publish):
             for watcher in self._watchers:

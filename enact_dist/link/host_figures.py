@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from enact_dist.core.shard.state import ShardState
     from enact_dist.link.lease import AnswerGate
-    from enact_dist.link.memory.payload_desk import PayloadDesk
+    from enact_dist.link.memory.payload_handler import PayloadHandler
     from enact_dist.link.store.thread import StoreThread
 
 
@@ -28,7 +28,12 @@ _log = logging.getLogger("enact.shard")
 
 
 def figures_of(
-    state: ShardState, payloads: PayloadDesk, gate: AnswerGate | None, *, parked: int, now_ns: int
+    state: ShardState,
+    payloads: PayloadHandler,
+    gate: AnswerGate | None,
+    *,
+    parked: int,
+    now_ns: int,
 ) -> dict[str, float]:
     """Return counters and current values, by name."""
     tenures = list(state.tenures.by_lock.values())

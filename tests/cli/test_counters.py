@@ -7,7 +7,7 @@ import enact_dist
 from enact_dist.core.protocol.messages import ListSessions, PlacementMap, ShardEntry
 from enact_dist.core.shard.state import ShardSettings
 from enact_dist.link.daemon.counters import OF_A_CONNECTION, OF_A_SHARD, described
-from enact_dist.link.memory.payload_desk import PayloadDesk
+from enact_dist.link.memory.payload_handler import PayloadHandler
 from enact_dist.link.opening import open_host
 
 OF_CLIENTS = (
@@ -50,7 +50,7 @@ def test_every_counter_of_a_shard_is_explained_and_no_other():
     root = Path(enact_dist.__file__).parent
     of_clients = {root / "link" / name for name in OF_CLIENTS}
     link = [path for path in (root / "link").rglob("*.py") if path not in of_clients]
-    now = set(PayloadDesk(None, 1).figures()) | {
+    now = set(PayloadHandler(None, 1).figures()) | {
         "alarms",
         "audit_left_out",
         "catalogue_left_out",

@@ -26,7 +26,7 @@ SERVE = (
 )
 
 
-class Story:
+class LogEvent:
     """Lines of the log; `stop` is set when one contains the mark for the wanted time.
 
     Of those before a line that contains `after` none is counted.
@@ -52,7 +52,7 @@ class Story:
 
 def test_actors_start_after_the_shards_are_ready_and_leave_before_them():
     """The first line of an actor comes after the shard's; at the end it is the other way round."""
-    story = Story("actor: ready")
+    story = LogEvent("actor: ready")
 
     status = story.run(task("actor", "actor", SERVE), task("shard", "shard", SERVE))
 
@@ -86,7 +86,7 @@ def test_actors_start_after_a_shard_whose_log_is_json(monkeypatch):
     lines = [{"event": "", "text": "ready: not"}, {"event": "shard.ready", "text": "ready: yes"}]
     printed = "".join(f"print({json.dumps(line)!r}, flush=True);" for line in lines)
     silent = SERVE.replace("print('ready: serving')", f"{printed}1")
-    story = Story("actor: ready")
+    story = LogEvent("actor: ready")
 
     story.run(task("actor", "actor", SERVE), task("shard", "shard", silent))
 
@@ -95,7 +95,7 @@ def test_actors_start_after_a_shard_whose_log_is_json(monkeypatch):
 
 def test_child_that_failed_is_started_again_with_growing_pauses():
     """A crash is logged with its status, and each pause is twice the one before."""
-    story = Story("exit status 5", times=3)
+    story = LogEvent("exit status 5", times=3)
 
     story.run(task("shard", "shard", "raise SystemExit(5)"))
 
@@ -106,7 +106,7 @@ def test_child_that_failed_is_started_again_with_growing_pauses():
 
 def test_pause_is_told_as_it_was_chosen():
     """A supervisor that gets no time between the end of a child and its line says no other one."""
-    story = Story("exit status 5")
+    story = LogEvent("exit status 5")
 
     class Judged(Supervisor):
         def _judge(self, child, status):
@@ -120,7 +120,7 @@ def test_pause_is_told_as_it_was_chosen():
 
 def test_killed_child_is_started_again_by_name_of_the_signal():
     """A child that was killed from outside is reported as such."""
-    story = Story("started again")
+    story = LogEvent("started again")
 
     story.run(task("shard", "shard", "import os; os.kill(os.getpid(), 9)"))
 
@@ -129,7 +129,7 @@ def test_killed_child_is_started_again_by_name_of_the_signal():
 
 def test_actor_that_is_done_is_not_started_again():
     """An actor that ends with status 0 has finished; the shards go on."""
-    story = Story("again: exit status 5", times=3, after="once: done")
+    story = LogEvent("again: exit status 5", times=3, after="once: done")
     again = task("again", "actor", "raise SystemExit(5)")  # is started again twice meanwhile
 
     story.run(task("shard", "shard", SERVE), task("once", "actor", "print('worked')"), again)
@@ -140,7 +140,7 @@ def test_actor_that_is_done_is_not_started_again():
 
 def test_shard_that_can_never_run_ends_everything():
     """Status 2 is a wrong configuration: the run ends with status 1 and says which shard."""
-    story = Story("never")
+    story = LogEvent("never")
 
     status = story.run(task("good", "shard", SERVE), task("bad", "shard", "raise SystemExit(2)"))
 
@@ -164,7 +164,7 @@ def test_end_by_a_signal_is_named(status, said):
 
 def test_child_that_a_signal_ends_while_it_drains_is_said_to():
     """It has no handler of its own; a kill by hand and one of the supervisor read the same."""
-    story = Story("ready:")
+    story = LogEvent("ready:")
 
     story.run(task("plain", "shard", "import signal; print('ready:'); signal.pause()"))
 
@@ -174,7 +174,7 @@ def test_child_that_a_signal_ends_while_it_drains_is_said_to():
 def test_second_signal_kills_what_does_not_leave():
     """Whoever asks twice does not wait for a child that ignores SIGTERM."""
     deaf = "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('ready:'); signal.pause()"
-    story = Story("ready:")
+    story = LogEvent("ready:")
 
     story.run(task("deaf", "shard", deaf), count=lambda: 2)
 
@@ -188,7 +188,7 @@ def test_child_that_drains_long_is_waited_for_and_no_other(monkeypatch, tmp_path
     os.mkfifo(gate)
     deaf = "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('ready:'); signal.pause()"
     slow = SERVE.replace("lambda *_: ", f"lambda *_: open({str(gate)!r}).read() or ")
-    story = Story("ready:", times=2)
+    story = LogEvent("ready:", times=2)
 
     def tell(name, line):
         story(name, line)
@@ -238,7 +238,7 @@ def test_end_of_a_child_is_noticed_though_its_output_cannot_be_read(monkeypatch)
         raise OSError(errno.EMFILE, "too many open files")
 
     monkeypatch.setattr(supervise, "select", SimpleNamespace(epoll=refused))
-    story = Story("done; it is not started again")
+    story = LogEvent("done; it is not started again")
 
     ended = run_in_time(Supervisor([task("one", "actor", "")], story), story.stop)
 
@@ -264,7 +264,7 @@ HOLDS = (
 
 def test_death_is_noticed_while_a_grandchild_holds_the_output(request):
     """The end of a child is that of its process, whoever still has its end of the pipe."""
-    story = Story("started again")
+    story = LogEvent("started again")
     say, held = story.__call__, []
 
     def note(name, line):
@@ -290,7 +290,7 @@ def test_death_is_noticed_while_a_grandchild_holds_the_output(request):
 
 def test_last_words_of_a_child_come_before_its_end():
     """All that a child has written is in the log before its death is told."""
-    story = Story("started again")
+    story = LogEvent("started again")
     code = "import os; print('x' * 60_000); print('last', flush=True); os.kill(os.getpid(), 9)"
 
     story.run(task("shard", "shard", code))
@@ -301,7 +301,7 @@ def test_last_words_of_a_child_come_before_its_end():
 
 def test_pids_name_the_running_children():
     """Who looks on can find the processes."""
-    story = Story("ready:")
+    story = LogEvent("ready:")
     supervisor = Supervisor([task("shard", "shard", SERVE)], story)
     seen = {}
 

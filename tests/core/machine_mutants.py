@@ -26,10 +26,10 @@ from mutants_readers import shows_the_newest_for_what_is_gone
 
 from enact_dist.core.protocol.messages import NOT_KEPT, Fenced, Finished, Prepared
 from enact_dist.core.protocol.records import Persist, Reply
-from enact_dist.core.shard.on_lock import LockDesk
-from enact_dist.core.shard.on_prepare import PrepareDesk
-from enact_dist.core.shard.on_session import SessionDesk
-from enact_dist.core.shard.on_view import ViewDesk
+from enact_dist.core.shard.on_lock import LockHandler
+from enact_dist.core.shard.on_prepare import PrepareHandler
+from enact_dist.core.shard.on_session import SessionHandler
+from enact_dist.core.shard.on_view import ViewHandler
 from enact_dist.core.state.clock import Stamps
 from enact_dist.core.state.commits import Commits
 from enact_dist.core.state.decisions import Decisions
@@ -52,7 +52,7 @@ def any_token_of_this_epoch(patch):
 
 def grants_a_seq_again(patch):
     """A released seq may be asked for once more."""
-    on_release = LockDesk.on_release
+    on_release = LockHandler.on_release
 
     def wrong(self, message, reply_to):
         held = message.lock in self._state.tenures.by_lock
@@ -60,12 +60,12 @@ def grants_a_seq_again(patch):
         if held:
             self._state.forget_top(message.lock)
 
-    patch(LockDesk, "on_release", wrong)
+    patch(LockHandler, "on_release", wrong)
 
 
 def view_does_not_renew(patch):
     """A view is counted, and does not lengthen the lease."""
-    on_take_view = ViewDesk.on_take_view
+    on_take_view = ViewHandler.on_take_view
 
     def wrong(self, message, reply_to):
         session = self._state.sessions.known(message.lock.session)
@@ -74,7 +74,7 @@ def view_does_not_renew(patch):
         if session:
             session.renewed_ns = before_ns
 
-    patch(ViewDesk, "on_take_view", wrong)
+    patch(ViewHandler, "on_take_view", wrong)
 
 
 def prepared_locks_end_with_their_client(patch):
@@ -88,7 +88,7 @@ def commits_in_flight_expire(patch):
 
 
 def _tells_early(patch, method, answer):
-    wrapped = getattr(PrepareDesk, method)
+    wrapped = getattr(PrepareHandler, method)
 
     def wrong(self, *arguments):
         for effect in wrapped(self, *arguments):
@@ -98,7 +98,7 @@ def _tells_early(patch, method, answer):
                 yield from (Reply(reply_to, answer(work.record)) for reply_to in replies)
             yield effect
 
-    patch(PrepareDesk, method, wrong)
+    patch(PrepareHandler, method, wrong)
 
 
 def promises_before_it_is_kept(patch):
@@ -165,9 +165,9 @@ def stamps_follow_the_wall_clock(patch):
 
 def keep_alives_free_nothing(patch):
     """What a client does not want any more stays."""
-    on_keep_alive = SessionDesk.on_keep_alive
+    on_keep_alive = SessionHandler.on_keep_alive
     wrong = lambda self, message, to: on_keep_alive(self, replace(message, view=()), to)  # noqa: E731
-    patch(SessionDesk, "on_keep_alive", wrong)
+    patch(SessionHandler, "on_keep_alive", wrong)
 
 
 def vanished_waiters_keep_their_place(patch):
@@ -180,12 +180,12 @@ def vanished_waiters_keep_their_place(patch):
         )
         return iter(())
 
-    patch(SessionDesk, "on_session_seen", wrong)
+    patch(SessionHandler, "on_session_seen", wrong)
 
 
 def welcomes_early(patch):
     """A session is welcomed before its record is on disk."""
-    answer_when_durable = SessionDesk.answer_when_durable
+    answer_when_durable = SessionHandler.answer_when_durable
 
     def wrong(self, reply_to, answer, records, *durability, **options):
         for effect in answer_when_durable(self, reply_to, answer, records, *durability, **options):
@@ -193,7 +193,7 @@ def welcomes_early(patch):
             if isinstance(effect, Persist):
                 yield next(reversed(self._unanswered.values())).pop()
 
-    patch(SessionDesk, "answer_when_durable", wrong)
+    patch(SessionHandler, "answer_when_durable", wrong)
 
 
 def retains_one_version_more(patch):

@@ -34,13 +34,13 @@ from enact_dist.core.protocol.messages import (
 )
 from enact_dist.core.protocol.records import (
     Call,
+    LogEvent,
     Persist,
     Persisted,
     Publish,
     Record,
     Recovered,
     Reply,
-    Story,
     Tick,
 )
 from enact_dist.core.shard.shard import Shard
@@ -109,7 +109,7 @@ class ShardBench:
         self.log: list[Record] = []
         self.pending: list[Persist] = []
         self.notices: list[object] = []
-        self.stories: list[Story] = []
+        self.stories: list[LogEvent] = []
         self.calls: list[tuple[str, object]] = []
         self.calls_about_places: list[tuple[str, object]] = []
         self.answers: dict[int, Answer] = {}
@@ -175,7 +175,7 @@ class ShardBench:
                 calls.append((effect.shard, effect.request))
             elif isinstance(effect, Publish):
                 self.notices.append(effect.notice)
-            elif isinstance(effect, Story):
+            elif isinstance(effect, LogEvent):
                 self.stories.append(effect)
         if self.disk_is_done:
             self.finish_disk()

@@ -11,9 +11,9 @@ NOTHING = Datum(b"", b"", 0)
 SLOT = Slot("online", "arm", "cloud")
 
 
-def stage(desk, file=FILE, offset=0, total=SIZE, body=b"", session=None):
+def stage(handler, file=FILE, offset=0, total=SIZE, body=b"", session=None):
     session = session or file.partition("-")[0]
-    return desk.stage(Stage(session, file, offset, total, Datum(b"", body, len(body))))
+    return handler.stage(Stage(session, file, offset, total, Datum(b"", body, len(body))))
 
 
 def commit_of(file=FILE, size=SIZE, session=SESSION, body=b""):
@@ -21,9 +21,9 @@ def commit_of(file=FILE, size=SIZE, session=SESSION, body=b""):
     return Commit(LockId(session, 0, 1), Token(1, 1), (write,), 0)
 
 
-def adopted(desk, *arguments, **options):
+def adopted(handler, *arguments, **options):
     """Return the datum that the shard would see."""
-    return desk.with_bodies(commit_of(*arguments, **options)).writes[0].datum
+    return handler.with_bodies(commit_of(*arguments, **options)).writes[0].datum
 
 
 def fill(folder, content, file=FILE):

@@ -12,7 +12,7 @@ from enact_dist import Aspect, Durability, Entity, Lock, View, Write, connect
 from enact_dist.core.protocol.messages import Stage, Staged
 from enact_dist.link.daemon.daemon import start_shard
 from enact_dist.link.daemon.settings import DaemonSettings
-from enact_dist.link.memory import payload_desk, payload_files
+from enact_dist.link.memory import payload_files, payload_handler
 from enact_dist.link.memory.ahead import (
     BYTES_MAX,
     FILES_MAX,
@@ -23,7 +23,7 @@ from enact_dist.link.memory.ahead import (
     NamesAhead,
 )
 from enact_dist.link.memory.maps import leftovers
-from enact_dist.link.memory.payload_desk import PayloadDesk
+from enact_dist.link.memory.payload_handler import PayloadHandler
 from enact_dist.testing import ManualClock
 
 IMAGE = Aspect("image", np.ndarray, Durability.VOLATILE)
@@ -31,17 +31,17 @@ CAMERA = Entity("camera")
 ROW = 1 << ROW_BITS
 
 
-def asked(desk, file="ann-1", ahead=1, total=SIZE):
+def asked(handler, file="ann-1", ahead=1, total=SIZE):
     """Ask for a payload and files behind it; return the answer once they are made."""
-    answer = desk.stage(Stage(file.partition("-")[0], file, 0, total, NOTHING, ahead))
-    desk.make_ahead()
+    answer = handler.stage(Stage(file.partition("-")[0], file, 0, total, NOTHING, ahead))
+    handler.make_ahead()
     return answer
 
 
-def committed(desk, number, size=SIZE):
+def committed(handler, number, size=SIZE):
     """Let a commit name a payload; return its datum once further files are made."""
-    datum = adopted(desk, f"ann-{number:x}", size=size, session="ann")
-    desk.make_ahead()
+    datum = adopted(handler, f"ann-{number:x}", size=size, session="ann")
+    handler.make_ahead()
     return datum
 
 
@@ -50,29 +50,29 @@ def committed(desk, number, size=SIZE):
 
 def files_appear_after_the_answer_and_can_be_committed_at_once(folder):
     """No answer waits for them; they are as good as those that were asked for."""
-    desk = PayloadDesk(folder, 20 * SIZE)
-    answer = desk.stage(Stage("ann", "ann-1", 0, SIZE, NOTHING, 2))
+    handler = PayloadHandler(folder, 20 * SIZE)
+    answer = handler.stage(Stage("ann", "ann-1", 0, SIZE, NOTHING, 2))
     assert (answer, names(folder)) == (Staged("ann-1", 0, True), ["ann-1"])
-    desk.make_ahead()
+    handler.make_ahead()
 
     assert names(folder) == ["ann-1", "ann-2", "ann-3"]
     assert [(folder.path / file).stat().st_size for file in names(folder)] == [SIZE] * 3
     assert [(folder.path / file).stat().st_mode & 0o777 for file in names(folder)] == [0o600] * 3
     (folder.path / "ann-2").write_bytes(b"x" * SIZE)
-    assert bytes(committed(desk, 2).body) == b"x" * SIZE
+    assert bytes(committed(handler, 2).body) == b"x" * SIZE
 
 
 def commits_bring_further_files_and_never_one_again(folder):
     """One behind each, or several once more than half are taken, in whatever order."""
-    desk = PayloadDesk(folder, 60 * SIZE)
-    asked(desk, ahead=1)
-    shown = [committed(desk, 1)]
+    handler = PayloadHandler(folder, 60 * SIZE)
+    asked(handler, ahead=1)
+    shown = [committed(handler, 1)]
     assert names(folder) == ["ann-1", "ann-2"]
-    shown.append(committed(desk, 2))
+    shown.append(committed(handler, 2))
     assert names(folder) == ["ann-1", "ann-2", "ann-3"]
 
-    asked(desk, "ann-a", ahead=3)
-    shown += [committed(desk, 0xC), committed(desk, 0xB)]
+    asked(handler, "ann-a", ahead=3)
+    shown += [committed(handler, 0xC), committed(handler, 0xB)]
     wanted = ["ann-a", "ann-b", "ann-c", "ann-d", "ann-e", "ann-f"]
     assert [file for file in names(folder) if file >= "ann-a"] == wanted
     del shown
@@ -81,66 +81,66 @@ def commits_bring_further_files_and_never_one_again(folder):
 
 def one_session_has_few_of_them(folder):
     """By number and by bytes, whatever it asks for; others have theirs all the same."""
-    desk = PayloadDesk(folder, 1 << 30)
-    asked(desk, ahead=1000)
-    asked(desk, "ann-1000", ahead=1000)
-    figures = desk.figures()
+    handler = PayloadHandler(folder, 1 << 30)
+    asked(handler, ahead=1000)
+    asked(handler, "ann-1000", ahead=1000)
+    figures = handler.figures()
     assert (figures["payload_drafts"], figures["files_ahead"]) == (2, FILES_MAX)
 
     large = BYTES_MAX // 2
-    asked(desk, "eve-1", ahead=5, total=large)
+    asked(handler, "eve-1", ahead=5, total=large)
     assert [file for file in names(folder) if file.startswith("eve")] == ["eve-1", "eve-2"]
 
 
 def shard_that_runs_short_makes_none(folder):
     """More than half of its room is left to what is asked for."""
-    desk = PayloadDesk(folder, 6 * SIZE)
-    asked(desk, ahead=5)
+    handler = PayloadHandler(folder, 6 * SIZE)
+    asked(handler, ahead=5)
 
     assert names(folder) == ["ann-1", "ann-2", "ann-3"]
-    assert desk.figures()["payload_bytes"] == 3 * SIZE
+    assert handler.figures()["payload_bytes"] == 3 * SIZE
 
 
 def files_ahead_go_before_history(folder):
     """What nobody has asked for is no reason to remove versions, or to refuse."""
     made = []
-    desk = PayloadDesk(folder, 6 * SIZE, make_room=made.append)
-    asked(desk, ahead=2)
-    answers = [asked(desk, f"eve-{number}", ahead=0) for number in range(1, 6)]
+    handler = PayloadHandler(folder, 6 * SIZE, make_room=made.append)
+    asked(handler, ahead=2)
+    answers = [asked(handler, f"eve-{number}", ahead=0) for number in range(1, 6)]
 
     assert all(isinstance(answer, Staged) and answer.shared for answer in answers)
-    assert (made, desk.figures()["files_ahead_removed"]) == ([], 2)
+    assert (made, handler.figures()["files_ahead_removed"]) == ([], 2)
     assert names(folder) == ["ann-1", *(f"eve-{number}" for number in range(1, 6))]
 
 
 def file_that_was_taken_back_may_be_asked_for(folder):
     """Its client does not know; it gets one, of that name, once there is room."""
-    desk = PayloadDesk(folder, 4 * SIZE)
-    asked(desk, ahead=1)
-    asked(desk, "eve-1", ahead=0, total=3 * SIZE)
+    handler = PayloadHandler(folder, 4 * SIZE)
+    asked(handler, ahead=1)
+    asked(handler, "eve-1", ahead=0, total=3 * SIZE)
     assert names(folder) == ["ann-1", "eve-1"]
-    desk.drop("eve-1")
+    handler.drop("eve-1")
     assert leftovers().wait(30)
 
-    assert asked(desk, "ann-2", ahead=0) == Staged("ann-2", 0, True)
+    assert asked(handler, "ann-2", ahead=0) == Staged("ann-2", 0, True)
 
 
 def files_end_with_their_session_or_after_a_time(folder):
     """They are no drafts of a client that died, so those have a counter of their own."""
     clock = ManualClock()
-    desk = PayloadDesk(folder, 60 * SIZE, clock=clock)
-    asked(desk, "gone-1", ahead=2)
-    asked(desk, "idle-1", ahead=2)
-    desk.drop("gone-1")
-    desk.drop("idle-1")
-    desk.sweep({"idle"}.__contains__, lambda _: False)
+    handler = PayloadHandler(folder, 60 * SIZE, clock=clock)
+    asked(handler, "gone-1", ahead=2)
+    asked(handler, "idle-1", ahead=2)
+    handler.drop("gone-1")
+    handler.drop("idle-1")
+    handler.sweep({"idle"}.__contains__, lambda _: False)
     assert names(folder) == ["idle-2", "idle-3"]
 
     clock.advance(30.1)
-    desk.sweep({"idle"}.__contains__, {"idle"}.__contains__)
+    handler.sweep({"idle"}.__contains__, {"idle"}.__contains__)
     assert names(folder) == ["idle-2", "idle-3"]
-    desk.sweep({"idle"}.__contains__, lambda _: False)
-    figures = desk.figures()
+    handler.sweep({"idle"}.__contains__, lambda _: False)
+    figures = handler.figures()
     assert names(folder) == []
     assert (figures["files_ahead_removed"], figures.get("drafts_swept", 0)) == (4, 0)
     assert (figures["payload_bytes"], figures["payload_files"]) == (0, 0)
@@ -148,11 +148,11 @@ def files_end_with_their_session_or_after_a_time(folder):
 
 def what_was_given_up_does_not_come_again(folder):
     """Nor does it by a late copy of the request that asked for it."""
-    desk = PayloadDesk(folder, 60 * SIZE)
-    asked(desk, ahead=2)
+    handler = PayloadHandler(folder, 60 * SIZE)
+    asked(handler, ahead=2)
     for file in ("ann-1", "ann-2"):
-        desk.stage(Stage("ann", file, 0, 0, NOTHING))
-    asked(desk, ahead=2)
+        handler.stage(Stage("ann", file, 0, 0, NOTHING))
+    asked(handler, ahead=2)
 
     assert names(folder) == ["ann-3", "ann-4"]  # in their place
 
@@ -176,70 +176,73 @@ def test_shard_keeps_the_rules(folder, rule):
 
 
 def _answers_late(patch):
-    stage = PayloadDesk.stage
+    stage = PayloadHandler.stage
 
-    def wrong(desk, message, owner=""):
-        answer = stage(desk, message, owner)
-        desk.make_ahead()
+    def wrong(handler, message, owner=""):
+        answer = stage(handler, message, owner)
+        handler.make_ahead()
         return answer
 
-    patch(PayloadDesk, "stage", wrong)
+    patch(PayloadHandler, "stage", wrong)
 
 
 def _forgets_to_count(patch):
-    made = PayloadDesk._made_ahead
+    made = PayloadHandler._made_ahead
 
-    def wrong(desk, file, wanted):
-        before = desk._bytes
-        found = made(desk, file, wanted)
-        desk._bytes = before
+    def wrong(handler, file, wanted):
+        before = handler._bytes
+        found = made(handler, file, wanted)
+        handler._bytes = before
         return found
 
-    patch(PayloadDesk, "_made_ahead", wrong)
+    patch(PayloadHandler, "_made_ahead", wrong)
 
 
 def _drops_for_good(patch):
-    gave_back = PayloadDesk._gave_back
+    gave_back = PayloadHandler._gave_back
 
-    def wrong(desk, total):
-        before = set(desk._drafts)
-        found = gave_back(desk, total)
-        for file in before - set(desk._drafts):
-            desk.drop(file)
+    def wrong(handler, total):
+        before = set(handler._drafts)
+        found = gave_back(handler, total)
+        for file in before - set(handler._drafts):
+            handler.drop(file)
         return found
 
-    patch(PayloadDesk, "_gave_back", wrong)
+    patch(PayloadHandler, "_gave_back", wrong)
 
 
 WRONG = {
     "answers once all are made": (_answers_late, 0),
     "makes none behind a commit": (
-        lambda patch: patch(PayloadDesk, "_adopt", _without_want(PayloadDesk._adopt)),
+        lambda patch: patch(PayloadHandler, "_adopt", _without_want(PayloadHandler._adopt)),
         1,
     ),
-    "makes as many as are asked for": (lambda patch: patch(payload_desk, "FILES_MAX", 1 << 30), 2),
-    "looks at no bytes": (lambda patch: patch(payload_desk, "BYTES_MAX", 1 << 60), 2),
+    "makes as many as are asked for": (
+        lambda patch: patch(payload_handler, "FILES_MAX", 1 << 30),
+        2,
+    ),
+    "looks at no bytes": (lambda patch: patch(payload_handler, "BYTES_MAX", 1 << 60), 2),
     "counts none": (_forgets_to_count, 3),
     "keeps them before history": (
-        lambda patch: patch(PayloadDesk, "_gave_back", lambda _desk, _total: False),
+        lambda patch: patch(PayloadHandler, "_gave_back", lambda _handler, _total: False),
         4,
     ),
     "ends a name that its client may use": (_drops_for_good, 5),
     "keeps them for ever": (
-        lambda patch: patch(PayloadDesk, "sweep", lambda _desk, _lives, _works: None),
+        lambda patch: patch(PayloadHandler, "sweep", lambda _handler, _lives, _works: None),
         6,
     ),
     "makes again what was given up": (
-        lambda patch: patch(payload_desk.UsedNames, "add", lambda _names, _name: None),
+        lambda patch: patch(payload_handler.UsedNames, "add", lambda _names, _name: None),
         7,
     ),
 }
 
 
 def _without_want(adopt):
-    def wrong(desk, file, size):
-        found = adopt(desk, file, size)
-        desk.wants_ahead.clear()
+    def wrong(handler, file, size):
+        found = adopt(handler, file, size)
+        handler.wants_ahead.clear()
         return found
 
     return wrong
@@ -257,17 +260,17 @@ def test_wrong_edit_of_a_rule_is_found(folder, monkeypatch, edit):
 
 def test_folder_that_takes_no_file_makes_none_and_says_nothing(folder, monkeypatch):
     """Nobody has asked for it; whoever does hears why."""
-    desk = PayloadDesk(folder, 20 * SIZE)
-    desk.stage(Stage("ann", "ann-1", 0, SIZE, NOTHING, 2))
+    handler = PayloadHandler(folder, 20 * SIZE)
+    handler.stage(Stage("ann", "ann-1", 0, SIZE, NOTHING, 2))
     full = SimpleNamespace(**{**vars(os), "posix_fallocate": _no_space})
     monkeypatch.setattr(payload_files, "os", full)
-    desk.make_ahead()
+    handler.make_ahead()
 
-    figures = desk.figures()
+    figures = handler.figures()
     assert names(folder) == ["ann-1"]
     assert (figures["payload_bytes"], figures.get("payload_fallbacks", 0)) == (SIZE, 0)
-    assert asked(desk, "ann-2").shared is False
-    assert desk.figures()["payload_fallbacks"] == 1
+    assert asked(handler, "ann-2").shared is False
+    assert handler.figures()["payload_fallbacks"] == 1
 
 
 def _no_space(*_):
@@ -276,7 +279,7 @@ def _no_space(*_):
 
 def test_request_for_a_file_that_is_being_made_waits_for_it(folder, monkeypatch):
     """Otherwise it would find the name taken, and its data would travel in messages."""
-    desk = PayloadDesk(folder, 20 * SIZE)
+    handler = PayloadHandler(folder, 20 * SIZE)
     begun, go_on = threading.Event(), threading.Event()
 
     def fallocate(*arguments):
@@ -284,25 +287,25 @@ def test_request_for_a_file_that_is_being_made_waits_for_it(folder, monkeypatch)
         assert go_on.wait(30)
         os.posix_fallocate(*arguments)
 
-    desk.stage(Stage("ann", "ann-1", 0, SIZE, NOTHING, 1))
+    handler.stage(Stage("ann", "ann-1", 0, SIZE, NOTHING, 1))
     slow = SimpleNamespace(**{**vars(os), "posix_fallocate": fallocate})
     monkeypatch.setattr(payload_files, "os", slow)
-    maker = threading.Thread(target=desk.make_ahead)
+    maker = threading.Thread(target=handler.make_ahead)
     maker.start()
     assert begun.wait(30)
     threading.Timer(0.05, go_on.set).start()
 
-    assert asked(desk, "ann-2", ahead=0) == Staged("ann-2", 0, True)
+    assert asked(handler, "ann-2", ahead=0) == Staged("ann-2", 0, True)
     maker.join()
-    assert "payload_fallbacks" not in desk.figures()
+    assert "payload_fallbacks" not in handler.figures()
 
 
 def test_shard_without_a_folder_makes_none():
     """Its clients fill no files."""
-    desk = PayloadDesk(None, 20 * SIZE)
+    handler = PayloadHandler(None, 20 * SIZE)
 
-    assert asked(desk, ahead=3).shared is False
-    assert desk.figures()["payload_drafts"] == 1
+    assert asked(handler, ahead=3).shared is False
+    assert handler.figures()["payload_drafts"] == 1
 
 
 # ---------------------------------------------------------------- the client's names

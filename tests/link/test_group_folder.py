@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 from ports import free_endpoint
 from test_ownership import KNOWS_ALL_BUT_THE_SECRET
-from test_payload_desk import FILE, SIZE, adopted, stage
+from test_payload_handler import FILE, SIZE, adopted, stage
 
 from enact_dist import Aspect, Durability, Entity, Lock, View, Write, connect
 from enact_dist.config.read import load_config
 from enact_dist.errors import LinkError
 from enact_dist.link.daemon.daemon import start_shard
 from enact_dist.link.daemon.settings import DaemonSettings
-from enact_dist.link.memory.payload_desk import PayloadDesk
+from enact_dist.link.memory.payload_handler import PayloadHandler
 from enact_dist.link.memory.shared_folder import SharedFolder, open_shared
 
 STRANGER = 65534
@@ -107,10 +107,10 @@ def run_as(user, group, text, *words):
 
 def test_only_the_owner_enters_the_folder_of_files(folder):
     """The group reaches the nonce and the socket; payloads and pages are 0600 in 0700."""
-    desk = PayloadDesk(folder, 10 * SIZE)
-    stage(desk)
+    handler = PayloadHandler(folder, 10 * SIZE)
+    stage(handler)
     draft = mode_of(folder.path / "files" / FILE)
-    datum = adopted(desk)
+    datum = adopted(handler)
 
     assert (draft, mode_of(folder.path / "files" / FILE)) == (0o600, 0o400)
     assert (mode_of(folder.path), mode_of(folder.path / "files") & 0o777) == (0o2710, 0o700)
@@ -139,11 +139,11 @@ def test_user_of_the_group_neither_reads_nor_changes_a_payload(folder, shared_ro
     os.chown(shared_root, 0, STRANGER)
     shared_root.chmod(0o3770)
     os.chown(folder.path, 0, STRANGER)
-    desk = PayloadDesk(folder, 10 * SIZE)
-    stage(desk)
+    handler = PayloadHandler(folder, 10 * SIZE)
+    stage(handler)
 
     before = run_as(STRANGER - 1, STRANGER, ATTACKS, folder.path, FILE)
-    datum = adopted(desk)
+    datum = adopted(handler)
     after = run_as(STRANGER - 1, STRANGER, ATTACKS, folder.path, FILE)
 
     assert (before, after) == ([], [])

@@ -12,24 +12,24 @@ from enact_dist.errors import EnactError, LeaseLostError, NoRoomError, ShardUnre
 from enact_dist.link.client import transfer
 from enact_dist.link.client.transfer import stage
 from enact_dist.link.memory.names import FIRST_STAGED
-from enact_dist.link.memory.payload_desk import GAPS_MAX, PayloadDesk
+from enact_dist.link.memory.payload_handler import GAPS_MAX, PayloadHandler
 
 SLICE = 10_000
 SESSION = "0123abcd"
 
 
 class Way:
-    """A client whose shards are payload desks; `carry` may be replaced to spoil what travels."""
+    """A client whose shards are payload handlers; `carry` may be replaced to spoil what travels."""
 
     def __init__(self, *shards, bytes_max=1 << 30):
-        self.desks = {shard: PayloadDesk(None, bytes_max) for shard in shards or ("s0",)}
+        self.handlers = {shard: PayloadHandler(None, bytes_max) for shard in shards or ("s0",)}
         self.core = SimpleNamespace(session=SESSION)
         self.carrier = SimpleNamespace(
             inside=False,
             fetch_bytes=SLICE,
             endpoint_of=lambda shard: f"tcp/{shard}:1",
             reason_away=lambda _: "",
-            request_all=lambda calls, **_: [self.desks[s].stage(m) for s, m in calls],
+            request_all=lambda calls, **_: [self.handlers[s].stage(m) for s, m in calls],
         )
         self.request_timeout_s = 10.0
         self.staged_numbers = itertools.count(FIRST_STAGED)
@@ -50,7 +50,7 @@ class Way:
         return SimpleNamespace(wait=wait, abandon=abandon)
 
     def carry(self, shard, request):
-        return self.desks[shard].stage(request)
+        return self.handlers[shard].stage(request)
 
     def rest(self, _pause_s):
         pass
@@ -60,7 +60,7 @@ class Way:
 
     def adopted(self, shard, write):
         """Return the bytes that a commit with this write would find."""
-        found = self.desks[shard]._adopted_by(without_body(write), SESSION)
+        found = self.handlers[shard]._adopted_by(without_body(write), SESSION)
         return bytes(found.datum.body)
 
 
@@ -110,7 +110,7 @@ def test_slices_that_are_lost_doubled_late_or_out_of_order_make_the_same_bytes(s
     way, draw = Way("s0", "s1"), random.Random(seed)
     writes = {
         shard: [write_of(f"{shard}/{i}", 90_000 + 7_777 * i, seed=i) for i in range(3)]
-        for shard in way.desks
+        for shard in way.handlers
     }
     late = []
     carry = way.carry
@@ -150,13 +150,13 @@ def test_slices_of_two_shards_alternate():
 def test_shard_without_room_refuses_by_name_and_forgets_what_came():
     """Over the cap the error names it, and the drafts of this commit are gone at both shards."""
     way = Way("s0", "s1")
-    way.desks["s1"] = PayloadDesk(None, 150_000)
+    way.handlers["s1"] = PayloadHandler(None, 150_000)
     writes = {"s0": [write_of("a", 100_000)], "s1": [write_of("b", 200_000)]}
 
     with pytest.raises(NoRoomError, match="of at most 150000"):
         stage(way, writes, lambda: None)
 
-    assert [desk.figures()["payload_drafts"] for desk in way.desks.values()] == [0, 0]
+    assert [handler.figures()["payload_drafts"] for handler in way.handlers.values()] == [0, 0]
     assert way.under_way == 0
 
 
@@ -187,7 +187,7 @@ def test_lock_that_is_lost_ends_the_transfer_after_a_loss():
 
     with pytest.raises(LeaseLostError, match="gone"):
         stage(way, {"s0": [write_of("a", 300_000)]}, lost)
-    assert way.desks["s0"].figures()["payload_drafts"] == 0
+    assert way.handlers["s0"].figures()["payload_drafts"] == 0
 
 
 def test_silent_shard_is_named():
@@ -212,29 +212,29 @@ def slice_of(offset, part, total=200_000, file=f"{SESSION}-1"):
     return Stage(SESSION, file, offset, total, Datum(b"", part, len(part)))
 
 
-def test_desk_says_how_much_has_come_without_a_hole():
+def test_handler_says_how_much_has_come_without_a_hole():
     """`have` is where the first hole begins; a draft with a hole is not adopted."""
-    desk = PayloadDesk(None, 1 << 30)
+    handler = PayloadHandler(None, 1 << 30)
     piece = bytes(range(100)) * 500
-    have = [desk.stage(slice_of(at, piece)).have for at in (50_000, 150_000, 0, 0, 100_000)]
+    have = [handler.stage(slice_of(at, piece)).have for at in (50_000, 150_000, 0, 0, 100_000)]
 
     assert have == [0, 0, 100_000, 100_000, 200_000]
 
 
-def test_desk_adopts_no_draft_with_a_hole():
+def test_handler_adopts_no_draft_with_a_hole():
     """A commit that names it is told that the bytes are not there."""
-    desk = PayloadDesk(None, 1 << 30)
-    desk.stage(slice_of(0, bytes(50_000)))
-    desk.stage(slice_of(100_000, bytes(100_000)))
+    handler = PayloadHandler(None, 1 << 30)
+    handler.stage(slice_of(0, bytes(50_000)))
+    handler.stage(slice_of(100_000, bytes(100_000)))
     write = WriteItem(Slot("w", "a", "b"), Datum(b"", b"", 200_000, 0, f"{SESSION}-1"))
 
-    assert desk._adopted_by(write, SESSION) is write
+    assert handler._adopted_by(write, SESSION) is write
 
 
-def test_desk_keeps_no_endless_list_of_holes():
+def test_handler_keeps_no_endless_list_of_holes():
     """A client that leaves a hole before each slice is refused, and the memory of it is bounded."""
-    desk = PayloadDesk(None, 1 << 30)
-    answers = [desk.stage(slice_of(2 * at + 1, b"x")) for at in range(GAPS_MAX + 1)]
+    handler = PayloadHandler(None, 1 << 30)
+    answers = [handler.stage(slice_of(2 * at + 1, b"x")) for at in range(GAPS_MAX + 1)]
 
     assert isinstance(answers[-2], Staged)
     assert isinstance(answers[-1], Refused)

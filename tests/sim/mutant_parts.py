@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from enact_dist.core.shard.on_prepare import PrepareDesk
+from enact_dist.core.shard.on_prepare import PrepareHandler
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -13,13 +13,13 @@ if TYPE_CHECKING:
 
 
 def forgets_what_ended(patch: Patch) -> None:
-    """Keep the desk that asks primaries from stumbling over locks that a mutant ended."""
+    """Keep the handler that asks primaries from stumbling over locks that a mutant ended."""
     for name in ("ask", "undecided"):
-        patch(PrepareDesk, name, _without_ended(getattr(PrepareDesk, name)))
+        patch(PrepareHandler, name, _without_ended(getattr(PrepareHandler, name)))
 
 
 def _without_ended(method: Any) -> Any:
-    def wrong(self: PrepareDesk) -> Any:
+    def wrong(self: PrepareHandler) -> Any:
         tenures = self._state.tenures.by_lock
         for lock in [lock for lock in self._ask_ns if lock not in tenures]:
             del self._ask_ns[lock]

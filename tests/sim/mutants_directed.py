@@ -15,8 +15,8 @@ from enact_dist.core.client.lock import MultiLock
 from enact_dist.core.client.own_commits import Unsettled
 from enact_dist.core.protocol.messages import Granted
 from enact_dist.core.protocol.records import Persist, PreparedEnded
-from enact_dist.core.shard.on_lock import LockDesk
-from enact_dist.core.shard.on_view import ViewDesk
+from enact_dist.core.shard.on_lock import LockHandler
+from enact_dist.core.shard.on_view import ViewHandler
 from enact_dist.core.state.commits import Commits
 from enact_dist.core.state.grants import Tenures
 from enact_dist.core.state.retention import SlotHistory
@@ -67,29 +67,29 @@ def stalls_count(patch: Patch) -> None:
 
 def releases_end_a_commit_in_flight(patch: Patch) -> None:
     """A late release takes the lock of a commit that the disk works on."""
-    on_release = LockDesk.on_release
+    on_release = LockHandler.on_release
 
-    def wrong(self: LockDesk, message: Any, reply_to: int) -> Any:
+    def wrong(self: LockHandler, message: Any, reply_to: int) -> Any:
         tenure = self._state.tenures.by_lock.get(message.lock)
         if tenure is not None and tenure.prepared is None:
             tenure.committing = False
         yield from on_release(self, message, reply_to)
 
-    patch(LockDesk, "on_release", wrong)
+    patch(LockHandler, "on_release", wrong)
 
 
 def releases_end_what_is_prepared(patch: Patch) -> None:
     """A client's release aborts what is prepared, though its primary may have committed."""
-    on_release = LockDesk.on_release
+    on_release = LockHandler.on_release
 
-    def wrong(self: LockDesk, message: Any, reply_to: int) -> Any:
+    def wrong(self: LockHandler, message: Any, reply_to: int) -> Any:
         tenure = self._state.tenures.by_lock.get(message.lock)
         if tenure is not None and tenure.prepared is not None and not tenure.committing:
             yield Persist(0, (PreparedEnded(message.lock),), Durability.OS)
             tenure.prepared = None
         yield from on_release(self, message, reply_to)
 
-    patch(LockDesk, "on_release", wrong)
+    patch(LockHandler, "on_release", wrong)
     forgets_what_ended(patch)
 
 
@@ -100,16 +100,16 @@ def shows_the_present_for_the_past(patch: Patch) -> None:
 
 def views_do_not_renew(patch: Patch) -> None:
     """A view is counted as seen, but does not lengthen the lease."""
-    on_take_view = ViewDesk.on_take_view
+    on_take_view = ViewHandler.on_take_view
 
-    def wrong(self: ViewDesk, message: Any, reply_to: int) -> Any:
+    def wrong(self: ViewHandler, message: Any, reply_to: int) -> Any:
         session = self._state.sessions.by_id.get(message.lock.session)
         renewed_ns = session.renewed_ns if session is not None else 0
         yield from on_take_view(self, message, reply_to)
         if session is not None:
             session.renewed_ns = renewed_ns
 
-    patch(ViewDesk, "on_take_view", wrong)
+    patch(ViewHandler, "on_take_view", wrong)
 
 
 def mixes_past_and_present(patch: Patch) -> None:

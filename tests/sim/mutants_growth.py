@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from enact_dist.core.shard.on_lock import LockDesk
+from enact_dist.core.shard.on_lock import LockHandler
 from enact_dist.core.state.catalogue import Catalogue
 from enact_dist.link.client.catalogue import KnownCatalogue
 
@@ -36,7 +36,7 @@ def lets_older_writers_in_after_a_restart(patch: Patch) -> None:
 
 def lets_in_who_missed_a_newer_type(patch: Patch) -> None:
     """A client that has not seen that a type has grown goes on writing the older one."""
-    patch(LockDesk, "_missed_type", lambda _desk, _message: None)
+    patch(LockHandler, "_missed_type", lambda _handler, _message: None)
 
 
 def keeps_no_newer_type(patch: Patch) -> None:

@@ -7,8 +7,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from enact_dist.core.protocol.messages import TakeView
-from enact_dist.core.shard.on_history import HistoryDesk
-from enact_dist.core.shard.on_view import ViewDesk
+from enact_dist.core.shard.on_history import HistoryHandler
+from enact_dist.core.shard.on_view import ViewHandler
 from enact_dist.core.state.history import History
 from enact_dist.core.state.retention import SlotHistory
 from enact_dist.core.state.slots import SlotMap
@@ -57,14 +57,14 @@ def takes_what_was_lost_for_null(patch: Patch) -> None:
 
 def answers_about_the_past_at_once(patch: Patch) -> None:
     """A view as of a stamp waits for no commit that may get a stamp before it."""
-    on_take_view = ViewDesk.on_take_view
+    on_take_view = ViewHandler.on_take_view
 
-    def wrong(self: ViewDesk, message: TakeView, reply_to: int) -> Iterator[Any]:
+    def wrong(self: ViewHandler, message: TakeView, reply_to: int) -> Iterator[Any]:
         self._undecided_ns = lambda _items: 1 << 62  # type: ignore[method-assign]
         yield from on_take_view(self, message, reply_to)
         del self._undecided_ns
 
-    patch(ViewDesk, "on_take_view", wrong)
+    patch(ViewHandler, "on_take_view", wrong)
 
 
 def loses_history_at_a_restart(patch: Patch) -> None:
@@ -91,8 +91,8 @@ def forgets_on_the_disk_what_is_kept(patch: Patch) -> None:
 
 def keeps_labels_in_memory(patch: Patch) -> None:
     """A label is told of before the store has it, which it never does."""
-    record = HistoryDesk._record
-    patch(HistoryDesk, "_record", lambda self, label: replace(record(self, label), versions=()))
+    record = HistoryHandler._record
+    patch(HistoryHandler, "_record", lambda self, label: replace(record(self, label), versions=()))
 
 
 def lets_go_of_what_others_keep(patch: Patch) -> None:

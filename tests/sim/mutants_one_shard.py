@@ -18,7 +18,7 @@ from enact_dist.core.client.plan import Phase
 from enact_dist.core.protocol.datum import Token
 from enact_dist.core.protocol.messages import Alive, Commit, Granted, GrantLeft, KeepAlive
 from enact_dist.core.protocol.records import Content, Persist, Reply
-from enact_dist.core.shard.on_session import SessionDesk
+from enact_dist.core.shard.on_session import SessionHandler
 from enact_dist.core.shard.state import ShardState
 from enact_dist.core.state import grants as tenures
 from enact_dist.core.state import lock_table
@@ -153,13 +153,13 @@ def guesses_lost_answers(patch: Patch) -> None:
 
 def no_reconciliation(patch: Patch) -> None:
     """Keep-alives free nothing: lost releases and orphan grants stay."""
-    on_keep_alive = SessionDesk.on_keep_alive
+    on_keep_alive = SessionHandler.on_keep_alive
 
-    def wrong(self: SessionDesk, message: KeepAlive, reply_to: int) -> Any:
+    def wrong(self: SessionHandler, message: KeepAlive, reply_to: int) -> Any:
         blind = KeepAlive(message.session, message.epoch, message.count, (), message.report)
         yield from on_keep_alive(self, blind, reply_to)
 
-    patch(SessionDesk, "on_keep_alive", wrong)
+    patch(SessionHandler, "on_keep_alive", wrong)
 
 
 def no_hold_limit(patch: Patch) -> None:
@@ -216,7 +216,7 @@ def welcomes_early(patch: Patch) -> None:
     """Welcome and Registered do not wait for the disk."""
 
     def wrong(
-        self: SessionDesk, reply_to: int, answer: Any, records: Any, *_: Any, **_options: Any
+        self: SessionHandler, reply_to: int, answer: Any, records: Any, *_: Any, **_options: Any
     ) -> Any:
         for session in self._state.sessions:
             session.present = session.durable = True
@@ -224,7 +224,7 @@ def welcomes_early(patch: Patch) -> None:
         if records:
             yield Persist(0, records, Durability.DURABLE)
 
-    patch(SessionDesk, "answer_when_durable", wrong)
+    patch(SessionHandler, "answer_when_durable", wrong)
 
 
 def stamps_follow_the_wall_clock(patch: Patch) -> None:
@@ -394,7 +394,7 @@ def keeps_every_outcome(patch: Patch) -> None:
 
 def renews_what_is_over(patch: Patch) -> None:
     """A shard answers a keep-alive as if the locks that it took away were still there."""
-    take_away, on_keep_alive = Tenures.take_away, SessionDesk.on_keep_alive
+    take_away, on_keep_alive = Tenures.take_away, SessionHandler.on_keep_alive
     gone: dict[Any, Tenure] = {}
 
     def taking(self: Tenures, tenure: Tenure, cause: str, *, now_ns: int) -> Any:
@@ -402,7 +402,7 @@ def renews_what_is_over(patch: Patch) -> None:
             gone[tenure.lock] = tenure
         yield from take_away(self, tenure, cause, now_ns=now_ns)
 
-    def wrong(self: SessionDesk, message: KeepAlive, reply_to: int) -> Any:
+    def wrong(self: SessionHandler, message: KeepAlive, reply_to: int) -> Any:
         lowest = {view.lane: view.seq for view in message.view}
         for effect in on_keep_alive(self, message, reply_to):
             answer = effect.answer if isinstance(effect, Reply) else None
@@ -416,4 +416,4 @@ def renews_what_is_over(patch: Patch) -> None:
             yield effect
 
     patch(Tenures, "take_away", taking)
-    patch(SessionDesk, "on_keep_alive", wrong)
+    patch(SessionHandler, "on_keep_alive", wrong)

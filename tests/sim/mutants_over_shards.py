@@ -13,8 +13,8 @@ from enact_dist.core.client.plan import Phase
 from enact_dist.core.protocol.messages import Finished
 from enact_dist.core.protocol.records import Persist, PreparedEnded, Reply
 from enact_dist.core.shard import on_prepare as prepares
-from enact_dist.core.shard.on_prepare import PrepareDesk
-from enact_dist.core.shard.on_view import ViewDesk
+from enact_dist.core.shard.on_prepare import PrepareHandler
+from enact_dist.core.shard.on_view import ViewHandler
 from enact_dist.core.state.commits import Commits
 from enact_dist.core.state.decisions import Decisions
 from enact_dist.core.state.tenure import Tenure
@@ -34,9 +34,9 @@ def prepared_locks_expire(patch: Patch) -> None:
 
 def promises_before_it_is_kept(patch: Patch) -> None:
     """Prepared is answered while the disk still works on the record."""
-    on_prepare = PrepareDesk.on_prepare
+    on_prepare = PrepareHandler.on_prepare
 
-    def wrong(self: PrepareDesk, message: Any, reply_to: int) -> Any:
+    def wrong(self: PrepareHandler, message: Any, reply_to: int) -> Any:
         for effect in on_prepare(self, message, reply_to):
             if isinstance(effect, Persist):
                 work = self._at_store[message.lock]
@@ -45,18 +45,18 @@ def promises_before_it_is_kept(patch: Patch) -> None:
                     yield Reply(reply, prepares._prepared(work.record))
             yield effect
 
-    patch(PrepareDesk, "on_prepare", wrong)
+    patch(PrepareHandler, "on_prepare", wrong)
 
 
 def aborts_what_is_open(patch: Patch) -> None:
     """A primary that has not decided yet says that it never will."""
-    resolved = PrepareDesk._resolved
+    resolved = PrepareHandler._resolved
 
-    def wrong(self: PrepareDesk, message: Any) -> Any:
+    def wrong(self: PrepareHandler, message: Any) -> Any:
         answer = resolved(self, message)
         return replace(answer, kind="aborted") if answer.kind == "open" else answer
 
-    patch(PrepareDesk, "_resolved", wrong)
+    patch(PrepareHandler, "_resolved", wrong)
 
 
 def forgets_decisions_at_a_restart(patch: Patch) -> None:
@@ -66,18 +66,18 @@ def forgets_decisions_at_a_restart(patch: Patch) -> None:
 
 def loses_prepared_at_a_restart(patch: Patch) -> None:
     """A restarted participant has forgotten what it has prepared."""
-    init = PrepareDesk.__init__
+    init = PrepareHandler.__init__
 
-    def wrong(self: PrepareDesk, state: Any, _recovered: Any, *others: Any) -> None:
+    def wrong(self: PrepareHandler, state: Any, _recovered: Any, *others: Any) -> None:
         init(self, state, (), *others)
 
-    patch(PrepareDesk, "__init__", wrong)
+    patch(PrepareHandler, "__init__", wrong)
 
 
 def never_tells_participants(patch: Patch) -> None:
     """Neither a decision is told nor is it asked for."""
     patch(Decisions, "tell", lambda _self, _now_ns: iter(()))
-    patch(PrepareDesk, "ask", lambda _self: iter(()))
+    patch(PrepareHandler, "ask", lambda _self: iter(()))
 
 
 def commits_without_votes(patch: Patch) -> None:
@@ -109,17 +109,17 @@ def takes_the_first_views(patch: Patch) -> None:
 
 def views_do_not_wait_for_the_undecided(patch: Patch) -> None:
     """A view promises to be current though a prepared commit may come before its end."""
-    patch(ViewDesk, "_undecided_ns", lambda _desk, _items: 1 << 62)
+    patch(ViewHandler, "_undecided_ns", lambda _handler, _items: 1 << 62)
 
 
 def promises_may_be_lost(patch: Patch) -> None:
     """What is prepared is written, but not forced to the disk."""
-    persist = PrepareDesk._persist
+    persist = PrepareHandler._persist
 
-    def wrong(self: PrepareDesk, work: Any, records: Any) -> Any:
+    def wrong(self: PrepareHandler, work: Any, records: Any) -> Any:
         return [replace(one, durability=Durability.OS) for one in persist(self, work, records)]
 
-    patch(PrepareDesk, "_persist", wrong)
+    patch(PrepareHandler, "_persist", wrong)
 
 
 def decisions_may_be_lost(patch: Patch) -> None:
@@ -129,20 +129,20 @@ def decisions_may_be_lost(patch: Patch) -> None:
 
 def promises_are_not_forgotten(patch: Patch) -> None:
     """The end of a promise is not recorded, so a restart takes it for open again."""
-    persist = PrepareDesk._persist
+    persist = PrepareHandler._persist
 
-    def wrong(self: PrepareDesk, work: Any, records: Any) -> Any:
+    def wrong(self: PrepareHandler, work: Any, records: Any) -> Any:
         kept = tuple(record for record in records if not isinstance(record, PreparedEnded))
         return persist(self, work, kept)
 
-    patch(PrepareDesk, "_persist", wrong)
+    patch(PrepareHandler, "_persist", wrong)
 
 
 def finishes_before_it_is_kept(patch: Patch) -> None:
     """A participant says finished while the disk still works on it."""
-    on_finish = PrepareDesk.on_finish
+    on_finish = PrepareHandler.on_finish
 
-    def wrong(self: PrepareDesk, message: Any, reply_to: int) -> Any:
+    def wrong(self: PrepareHandler, message: Any, reply_to: int) -> Any:
         yield from on_finish(self, message, reply_to)
         for work in self._at_store.values():
             if work.record.lock == message.lock:
@@ -150,7 +150,7 @@ def finishes_before_it_is_kept(patch: Patch) -> None:
                 for reply in replies:
                     yield Reply(reply, Finished(message.lock))
 
-    patch(PrepareDesk, "on_finish", wrong)
+    patch(PrepareHandler, "on_finish", wrong)
 
 
 def forgets_decisions_too_early(patch: Patch) -> None:
@@ -167,27 +167,27 @@ def forgets_decisions_too_early(patch: Patch) -> None:
 
 def aborts_what_the_disk_works_on(patch: Patch) -> None:
     """A primary says that it never will while its disk works on the decision."""
-    resolved = PrepareDesk._resolved
+    resolved = PrepareHandler._resolved
 
-    def wrong(self: PrepareDesk, message: Any) -> Any:
+    def wrong(self: PrepareHandler, message: Any) -> Any:
         answer = resolved(self, message)
         tenure = self._state.tenures.by_lock.get(message.lock)
         if answer.kind == "open" and tenure is not None and tenure.committing:
             return replace(answer, kind="aborted")
         return answer
 
-    patch(PrepareDesk, "_resolved", wrong)
+    patch(PrepareHandler, "_resolved", wrong)
 
 
 def stamps_before_what_was_promised(patch: Patch) -> None:
     """A participant's stamp may lie before what its views were told."""
-    finish = PrepareDesk._finish
+    finish = PrepareHandler._finish
 
-    def wrong(self: PrepareDesk, tenure: Any, position: Any, replies: Any) -> Any:
+    def wrong(self: PrepareHandler, tenure: Any, position: Any, replies: Any) -> Any:
         record = tenure.prepared
         tenure.prepared = replace(record, stamp_ns=0)
         yield from finish(
             self, tenure, position._replace(stamp_ns=record.stamp_ns - 10**6), replies
         )
 
-    patch(PrepareDesk, "_finish", wrong)
+    patch(PrepareHandler, "_finish", wrong)

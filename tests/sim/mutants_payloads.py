@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from enact_dist.link.memory import payload_desk
+from enact_dist.link.memory import payload_handler
 from enact_dist.link.memory.ahead import NamesAhead
 from enact_dist.link.memory.names import UsedNames
 from enact_dist.link.memory.payload_client import SharedPayloads
-from enact_dist.link.memory.payload_desk import PayloadDesk
+from enact_dist.link.memory.payload_handler import PayloadHandler
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -18,48 +18,52 @@ if TYPE_CHECKING:
 
 def adopts_half_a_payload(patch: Patch) -> None:
     """A commit gets a payload of which slices are missing."""
-    patch(payload_desk.Drafted, "whole", property(lambda _draft: True))
+    patch(payload_handler.Drafted, "whole", property(lambda _draft: True))
 
 
 def keeps_what_was_adopted(patch: Patch) -> None:
-    """The desk itself holds on to payloads."""
-    adopt = PayloadDesk._adopt
+    """The handler itself holds on to payloads."""
+    adopt = PayloadHandler._adopt
 
-    def wrong(self: PayloadDesk, file: str, size: int) -> Any:
+    def wrong(self: PayloadHandler, file: str, size: int) -> Any:
         memory = adopt(self, file, size)
         self.counters.setdefault("kept", []).append(memory)
         return memory
 
-    patch(PayloadDesk, "_adopt", wrong)
+    patch(PayloadHandler, "_adopt", wrong)
 
 
 def never_gives_up_drafts(patch: Patch) -> None:
     """A draft outlives the session that will not commit it any more."""
-    patch(PayloadDesk, "sweep", lambda _desk, _lives, _works: None)
+    patch(PayloadHandler, "sweep", lambda _handler, _lives, _works: None)
 
 
 def keeps_drafts_without_slices(patch: Patch) -> None:
     """A draft of a client that has given it up stays as long as its session."""
-    patch(payload_desk, "DRAFT_NS", 1 << 62)
+    patch(payload_handler, "DRAFT_NS", 1 << 62)
 
 
 def counts_from_the_first_slice(patch: Patch) -> None:
     """The time of a draft runs from its first slice, whatever comes later."""
-    take = PayloadDesk._take
+    take = PayloadHandler._take
 
-    def wrong(self: PayloadDesk, file: str, draft: Any, offset: int, slice_: Any) -> Any:
+    def wrong(self: PayloadHandler, file: str, draft: Any, offset: int, slice_: Any) -> Any:
         begun_ns = draft.touched_ns
         answer = take(self, file, draft, offset, slice_)
         draft.touched_ns = begun_ns
         return answer
 
-    patch(PayloadDesk, "_take", wrong)
+    patch(PayloadHandler, "_take", wrong)
 
 
 def gives_up_drafts_of_holders(patch: Patch) -> None:
     """A draft without slices is given up though its client holds a lock."""
-    sweep = PayloadDesk.sweep
-    patch(PayloadDesk, "sweep", lambda desk, lives, _works: sweep(desk, lives, lambda _: False))
+    sweep = PayloadHandler.sweep
+    patch(
+        PayloadHandler,
+        "sweep",
+        lambda handler, lives, _works: sweep(handler, lives, lambda _: False),
+    )
 
 
 def makes_drafts_of_late_slices(patch: Patch) -> None:
@@ -72,14 +76,14 @@ def makes_drafts_of_late_slices(patch: Patch) -> None:
 
 def makes_a_file_again_that_was_taken_back(patch: Patch) -> None:
     """What was taken back is forgotten: its name comes again, with an empty file."""
-    remove = PayloadDesk._remove
+    remove = PayloadHandler._remove
 
-    def wrong(self: PayloadDesk, files: list[str]) -> Any:
+    def wrong(self: PayloadHandler, files: list[str]) -> Any:
         gone = remove(self, files)
         self._taken_back = UsedNames()
         return gone
 
-    patch(PayloadDesk, "_remove", wrong)
+    patch(PayloadHandler, "_remove", wrong)
 
 
 def leaves_files_ahead_to_both_of_a_fork(patch: Patch) -> None:
@@ -101,53 +105,57 @@ def gives_a_number_to_two_threads(patch: Patch) -> None:
 
 def makes_ahead_into_the_room_of_others(patch: Patch) -> None:
     """Files ahead take all of the room, not half of it."""
-    made_ahead = PayloadDesk._made_ahead
+    made_ahead = PayloadHandler._made_ahead
 
-    def wrong(self: PayloadDesk, file: str, wanted: Any) -> bool:
+    def wrong(self: PayloadHandler, file: str, wanted: Any) -> bool:
         self._bytes_max *= 2
         try:
             return made_ahead(self, file, wanted)
         finally:
             self._bytes_max //= 2
 
-    patch(PayloadDesk, "_made_ahead", wrong)
+    patch(PayloadHandler, "_made_ahead", wrong)
 
 
 def keeps_files_ahead_of_the_dead(patch: Patch) -> None:
     """A file that nobody has asked for outlives its session."""
-    given_up = payload_desk.given_up
+    given_up = payload_handler.given_up
 
     def wrong(drafts: Any, *others: Any) -> list[str]:
         return [file for file in given_up(drafts, *others) if drafts[file].asked]
 
-    patch(payload_desk, "given_up", wrong)
+    patch(payload_handler, "given_up", wrong)
 
 
 def leaves_the_files_of_what_is_gone(patch: Patch) -> None:
     """Bytes are no longer counted, and their file stays."""
-    ended = PayloadDesk._ended
-    patch(PayloadDesk, "_ended", lambda desk, file, _disk, size: ended(desk, file, None, size))
+    ended = PayloadHandler._ended
+    patch(
+        PayloadHandler,
+        "_ended",
+        lambda handler, file, _disk, size: ended(handler, file, None, size),
+    )
 
 
 def counts_no_files_ahead(patch: Patch) -> None:
     """Files made ahead take room that nobody counts."""
-    made_ahead = PayloadDesk._made_ahead
+    made_ahead = PayloadHandler._made_ahead
 
-    def wrong(self: PayloadDesk, file: str, wanted: Any) -> bool:
+    def wrong(self: PayloadHandler, file: str, wanted: Any) -> bool:
         used = self._bytes
         made = made_ahead(self, file, wanted)
         self._bytes = used
         return made
 
-    patch(PayloadDesk, "_made_ahead", wrong)
+    patch(PayloadHandler, "_made_ahead", wrong)
 
 
 def publishes_what_its_client_may_still_fill(patch: Patch) -> None:
     """A commit that names no payload gets the newest file of its session."""
-    adopt = PayloadDesk._adopt
+    adopt = PayloadHandler._adopt
 
-    def wrong(self: PayloadDesk, file: str, size: int) -> Any:
+    def wrong(self: PayloadHandler, file: str, size: int) -> Any:
         others = [name for name, draft in self._drafts.items() if draft.size == size]
         return adopt(self, file if file in self._drafts or not others else others[-1], size)
 
-    patch(PayloadDesk, "_adopt", wrong)
+    patch(PayloadHandler, "_adopt", wrong)

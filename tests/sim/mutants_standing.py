@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from enact_dist.core.shard.on_lock import LockDesk
+from enact_dist.core.shard.on_lock import LockHandler
 from enact_dist.core.shard.state import StandingLocks
 from enact_dist.verify.simulation.work.standing import StandingActors
 
@@ -16,24 +16,26 @@ if TYPE_CHECKING:
 
 def parks_without_a_look(patch: Patch) -> None:
     """A shard compares at changes only, not when a request comes."""
-    begin_standing, has_news = LockDesk.begin_standing, LockDesk._has_news
-    at_change: list[LockDesk] = []
+    begin_standing, has_news = LockHandler.begin_standing, LockHandler._has_news
+    at_change: list[LockHandler] = []
 
-    def begins(self: LockDesk, changed: Any) -> Any:
+    def begins(self: LockHandler, changed: Any) -> Any:
         at_change.append(self)
         effects = begin_standing(self, changed)
         at_change.clear()
         return effects
 
-    patch(LockDesk, "begin_standing", begins)
+    patch(LockHandler, "begin_standing", begins)
     patch(
-        LockDesk, "_has_news", lambda desk, message: desk in at_change and has_news(desk, message)
+        LockHandler,
+        "_has_news",
+        lambda handler, message: handler in at_change and has_news(handler, message),
     )
 
 
 def grants_without_news(patch: Patch) -> None:
     """A lock that waits for news enters the queue at once."""
-    patch(LockDesk, "_has_news", lambda _desk, _message: True)
+    patch(LockHandler, "_has_news", lambda _handler, _message: True)
 
 
 def counts_lost_updates_as_seen(patch: Patch) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from enact_dist.core.protocol.messages import DropWorld
 from enact_dist.core.protocol.records import Persist, Publish
 from enact_dist.core.shard import on_prepare as prepares
-from enact_dist.core.shard.on_world import WorldDesk, _Making
+from enact_dist.core.shard.on_world import WorldHandler, _Making
 from enact_dist.core.shard.state import ShardState
 from enact_dist.core.state.commits import Commits
 from enact_dist.core.state.sessions import SessionState
@@ -76,7 +76,7 @@ def forks_the_present(patch: Patch) -> None:
 
 def forks_before_the_undecided(patch: Patch) -> None:
     """A fork does not wait for commits that may still become a part of it."""
-    patch(WorldDesk, "_undecided", lambda _desk, _message: False)
+    patch(WorldHandler, "_undecided", lambda _handler, _message: False)
 
 
 def forks_at_a_moment_of_its_own(patch: Patch) -> None:
@@ -91,9 +91,9 @@ def forks_at_a_moment_of_its_own(patch: Patch) -> None:
 
 def tells_of_forks_too_early(patch: Patch) -> None:
     """A fork is used and told while the disk still works on it."""
-    make = WorldDesk._make
+    make = WorldHandler._make
 
-    def wrong(self: WorldDesk, act: Any) -> Any:
+    def wrong(self: WorldHandler, act: Any) -> Any:
         for effect in make(self, act):
             if isinstance(effect, Persist):
                 yield replace(effect, ticket=0)
@@ -101,7 +101,7 @@ def tells_of_forks_too_early(patch: Patch) -> None:
             else:
                 yield effect
 
-    patch(WorldDesk, "_make", wrong)
+    patch(WorldHandler, "_make", wrong)
 
 
 def forks_name_no_source(patch: Patch) -> None:
@@ -132,20 +132,20 @@ def forgets_versions_at_a_restart(patch: Patch) -> None:
 
 def drops_under_locks(patch: Patch) -> None:
     """A context is dropped though somebody has a lock in it."""
-    refused = WorldDesk._drop_refused
+    refused = WorldHandler._drop_refused
 
-    def wrong(self: WorldDesk, world: str) -> Any:
+    def wrong(self: WorldHandler, world: str) -> Any:
         answer = refused(self, world)
         return None if getattr(answer, "code", "") == "held" else answer
 
-    patch(WorldDesk, "_drop_refused", wrong)
+    patch(WorldHandler, "_drop_refused", wrong)
 
 
 def drops_in_silence(patch: Patch) -> None:
     """Nobody who watches is told that a context has gone."""
-    persisted = WorldDesk._persisted
+    persisted = WorldHandler._persisted
 
-    def wrong(self: WorldDesk, act: Any, now_ns: int) -> Any:
+    def wrong(self: WorldHandler, act: Any, now_ns: int) -> Any:
         commits, drop = self._state.commits, isinstance(act.message, DropWorld)
         number = commits.notice_number
         for effect in persisted(self, act, now_ns):
@@ -154,7 +154,7 @@ def drops_in_silence(patch: Patch) -> None:
         if drop:
             commits.notice_number = number
 
-    patch(WorldDesk, "_persisted", wrong)
+    patch(WorldHandler, "_persisted", wrong)
 
 
 def drops_half_of_it(patch: Patch) -> None:

@@ -179,8 +179,8 @@ HAPPENED = (
     "payloads without room",
     "clients forked",
     "clients that died over a file",
-    "desk: files_ahead_used",
-    "desk: files_ahead_removed",
+    "handler: files_ahead_used",
+    "handler: files_ahead_removed",
     "files ahead at a crash",
     "files taken back from a client",
     # What stayed with a session between two locks.

@@ -9,7 +9,7 @@ import pytest
 from enact_dist.cli.main import main
 from enact_dist.core.protocol.messages import Pong
 from enact_dist.core.shard import inspection
-from enact_dist.core.shard.on_lock import LockDesk
+from enact_dist.core.shard.on_lock import LockHandler
 from enact_dist.core.shard.shard import Shard
 from enact_dist.verify.frames.hostile import KINDS
 from enact_dist.verify.frames.lives import STORE_EVERY, BrokenLife, LifeTally, live
@@ -64,7 +64,7 @@ FAULTS = {
         lambda *_: Pong("s0", 1 << 70, True, "", 0),
         "an answer cannot be sent.*Ping",
     ),
-    "no answer": (LockDesk, "on_release", lambda *_: iter(()), "stayed unanswered.*Release"),
+    "no answer": (LockHandler, "on_release", lambda *_: iter(()), "stayed unanswered.*Release"),
 }
 
 

@@ -20,7 +20,7 @@ import enum
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
-from enact_dist.core.protocol.records import Effect, Persist, Story
+from enact_dist.core.protocol.records import Effect, LogEvent, Persist
 
 DRIFT_PPM: Final = 20_000
 """How much two clocks may differ: the holder counts less, a standby counts more."""
@@ -28,7 +28,7 @@ OUTAGE_NS: Final = 3_000_000_000
 """How much longer a standby waits after it had lost the database itself."""
 
 
-_STAY: Final = frozenset((Persist, Story))
+_STAY: Final = frozenset((Persist, LogEvent))
 """Effects that reach no client and no other shard."""
 
 

@@ -357,7 +357,7 @@ class Compare:
 
 
 @message
-class Story:
+class LogEvent:
     """One line for the log: what the shard decided and about whom; `grave` needs people."""
 
     event: str
@@ -365,7 +365,7 @@ class Story:
     grave: bool = False
 
 
-Effect = Reply | Persist | Publish | Call | Compare | Story
+Effect = Reply | Persist | Publish | Call | Compare | LogEvent
 Then = Callable[[int], Iterable[Effect]]
 """How the shard goes on once records are kept: the time by then, to further effects."""
 

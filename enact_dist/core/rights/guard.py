@@ -58,7 +58,7 @@ from enact_dist.core.protocol.messages import (
     TakeView,
     WriteItem,
 )
-from enact_dist.core.protocol.records import Content, Story
+from enact_dist.core.protocol.records import Content, LogEvent
 from enact_dist.core.rights.rules import ALL, UNPROVEN, WRITE, Rights, path_of
 from enact_dist.terms import ACCESSES
 
@@ -197,7 +197,7 @@ class Guard:
         self.denials.append((self.subject, right, what, refused))
         return refused
 
-    def stories(self, now_ns: int, wall_ns: int) -> Iterator[Story]:
+    def log_events(self, now_ns: int, wall_ns: int) -> Iterator[LogEvent]:
         """Note the refusals; yield what the log is to say: one line per subject, right, second."""
         for subject, right, what, refused in self.denials:
             self._note((subject, right, what), wall_ns)
@@ -211,7 +211,7 @@ class Guard:
             self._told[key] = now_ns, 0
             more = f"; {left_out} more since the last line" if left_out else ""
             asker = f" (asked by {self.asker})" if refused.code == PERMISSION and self.asker else ""
-            yield Story("permission.denied", f"{refused.text}{asker}{more}")
+            yield LogEvent("permission.denied", f"{refused.text}{asker}{more}")
         self.denials.clear()
 
     def _note(self, key: tuple[str, str, str], wall_ns: int) -> None:

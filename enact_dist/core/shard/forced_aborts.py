@@ -29,9 +29,9 @@ from enact_dist.core.protocol.records import (
     Effect,
     ForcedEnded,
     ForcedRecord,
+    LogEvent,
     Persist,
     Reply,
-    Story,
 )
 from enact_dist.core.state.audit import ALARM, CONFIRMED
 from enact_dist.terms import Durability
@@ -106,7 +106,7 @@ class ForcedAborts:
             text = f"{_named(record)}: {record.primary} is back and had not committed it"
             self._state.count("forced_confirmed")
             kept = self._state.audit.keep(AuditRecord(self._state.wall_ns, text, CONFIRMED))
-            yield Story("lock.forced", text)
+            yield LogEvent("lock.forced", text)
             yield Persist(0, (kept, ForcedEnded(record.lock)), Durability.OS)
 
     def committed(self, lock: LockId, position: Position, replies: list[int]) -> Iterator[Effect]:
@@ -126,7 +126,7 @@ class ForcedAborts:
         self._state.count("forced_but_committed")
         kept = self._state.audit.keep(AuditRecord(self._state.wall_ns, text, ALARM))
         ending = self._at_store[lock] = _Ending(record, replies)
-        yield Story("lock.alarm", text, grave=True)
+        yield LogEvent("lock.alarm", text, grave=True)
         then = partial(self._persisted, ending)
         yield from self._state.persist((kept, ForcedEnded(lock)), Durability.DURABLE, then)
 

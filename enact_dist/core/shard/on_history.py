@@ -24,7 +24,7 @@ from enact_dist.core.protocol.messages import (
     Versions,
 )
 from enact_dist.core.protocol.pages import VERSIONS_OF_A_LOOK, bytes_in_frame, over_slots, page_of
-from enact_dist.core.protocol.records import KeptRecord, Persist, Reply, Story
+from enact_dist.core.protocol.records import KeptRecord, LogEvent, Persist, Reply
 from enact_dist.core.state.slots import state_of
 from enact_dist.terms import Durability
 
@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.pages import Step
     from enact_dist.core.protocol.parts import Cause, VersionEntry
     from enact_dist.core.protocol.records import Content, Effect, MakeRoom, Record
-    from enact_dist.core.shard.on_prepare import PrepareDesk
-    from enact_dist.core.shard.on_session import SessionDesk
+    from enact_dist.core.shard.on_prepare import PrepareHandler
+    from enact_dist.core.shard.on_session import SessionHandler
     from enact_dist.core.shard.state import ShardState
     from enact_dist.core.state.slots import SlotMap
 
@@ -85,7 +85,7 @@ ASKED_MAX: Final = 4096
 """Versions or data that one question names."""
 
 
-class LineageDesk:
+class LineageHandler:
     """Everything about why data are as they are."""
 
     def __init__(self, state: ShardState) -> None:
@@ -167,10 +167,12 @@ KEPT_BYTES_MAX: Final = 256 << 20
 """Bytes of kept data at most, payloads left out, which have a cap of their own."""
 
 
-class HistoryDesk:
+class HistoryHandler:
     """Everything about replaced versions, but views of them."""
 
-    def __init__(self, state: ShardState, sessions: SessionDesk, prepares: PrepareDesk) -> None:
+    def __init__(
+        self, state: ShardState, sessions: SessionHandler, prepares: PrepareHandler
+    ) -> None:
         self._state = state
         self._sessions = sessions
         self._prepares = prepares
@@ -295,7 +297,9 @@ class HistoryDesk:
         gone, size = self._state.slots.make_room(message.bytes)
         if gone:
             self._state.count("history_dropped", gone)
-            yield Story("history.dropped", f"{gone} replaced versions of {size} bytes at the cap")
+            yield LogEvent(
+                "history.dropped", f"{gone} replaced versions of {size} bytes at the cap"
+            )
 
     def tidy(self) -> Iterator[Effect]:
         """Remove expired states, and tell the store unless a commit has done so."""

@@ -30,7 +30,7 @@ from enact_dist.terms import ACCESSES
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from enact_dist.core.shard.on_prepare import PrepareDesk
+    from enact_dist.core.shard.on_prepare import PrepareHandler
     from enact_dist.core.shard.state import ShardState
 
 ITEMS_MAX: Final = 4096
@@ -45,10 +45,10 @@ DAMAGED: Final = "damaged"
 """The code of a refusal because the stored bytes of a datum are not what was stored."""
 
 
-class LockDesk:
+class LockHandler:
     """Everything about who gets which lock, and the data that come with it."""
 
-    def __init__(self, state: ShardState, prepares: PrepareDesk) -> None:
+    def __init__(self, state: ShardState, prepares: PrepareHandler) -> None:
         self._state = state
         self._prepares = prepares
 

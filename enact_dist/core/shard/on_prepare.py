@@ -49,12 +49,12 @@ from enact_dist.core.protocol.records import (
     Called,
     Effect,
     ForcedRecord,
+    LogEvent,
     Persist,
     PreparedEnded,
     PreparedRecord,
     Record,
     Reply,
-    Story,
 )
 from enact_dist.core.shard.forced_aborts import ForcedAborts
 from enact_dist.core.state.audit import FORCED
@@ -94,7 +94,7 @@ class _AtStore:
     told: Position | None = None
 
 
-class PrepareDesk:
+class PrepareHandler:
     """Everything that is prepared at this shard, and what it tells others about its own locks."""
 
     def __init__(
@@ -223,7 +223,7 @@ class PrepareDesk:
             self._state.count("decisions_refused")
             if lock not in self._refused:
                 self._refused.add(lock)
-                yield Story("lock.in_doubt", wrong.text, grave=True)
+                yield LogEvent("lock.in_doubt", wrong.text, grave=True)
         return wrong
 
     def _finish(self, tenure: Tenure, position: Position, replies: list[int]) -> Iterator[Effect]:
@@ -272,7 +272,7 @@ class PrepareDesk:
         elif answer.kind == RESOLVED_ABORTED and not tenure.committing:
             self._state.count("resolved_aborted")
             told = self._state.tenures.told(tenure, self._state.now_ns)
-            yield Story("lock.aborted", f"{told}: {message.shard} has not committed it")
+            yield LogEvent("lock.aborted", f"{told}: {message.shard} has not committed it")
             yield Persist(0, (PreparedEnded(tenure.lock),), Durability.OS)
             yield from self._end(tenure)
 
@@ -368,7 +368,7 @@ class PrepareDesk:
         work = _AtStore(tenure, record, forced=forced, holder=holder, asked=message)
         work.operators.append(reply_to)
         audit = state.audit.keep(AuditRecord(state.wall_ns, text, FORCED, state.asker))
-        yield Story("lock.forced", text, grave=True)
+        yield LogEvent("lock.forced", text, grave=True)
         yield from self._persist(work, (audit, forced, PreparedEnded(tenure.lock)))
 
     def _given_up(self, work: _AtStore, forced: ForcedRecord) -> Iterator[Effect]:

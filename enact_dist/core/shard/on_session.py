@@ -24,6 +24,7 @@ from enact_dist.core.protocol.messages import (
 from enact_dist.core.protocol.records import (
     AspectRecord,
     Effect,
+    LogEvent,
     Persist,
     Record,
     Reply,
@@ -32,7 +33,6 @@ from enact_dist.core.protocol.records import (
     SessionEnded,
     SessionRecord,
     SessionSeen,
-    Story,
     WorldRecord,
 )
 from enact_dist.core.rights.rules import UNPROVEN
@@ -50,7 +50,7 @@ TTL_NS_MIN: Final = 100_000_000
 """Leases shorter than this would be lost to ordinary scheduling delays."""
 
 
-class SessionDesk:
+class SessionHandler:
     """Everything about who is alive."""
 
     def __init__(self, state: ShardState) -> None:
@@ -194,7 +194,7 @@ class SessionDesk:
         for entry in succeeded:
             self._state.count("types_succeeded")
             told = f"aspect {entry.name!r} has the datum type {entry.fingerprint} from now on"
-            yield Story("aspect.type", f"{told}, which succeeds {entry.older[-1]}")
+            yield LogEvent("aspect.type", f"{told}, which succeeds {entry.older[-1]}")
         answer = Registered(*catalogue.shown()[:3])
         yield from self.answer_when_durable(reply_to, answer, tuple(records))
 
@@ -215,7 +215,7 @@ class SessionDesk:
             if unwanted and not (tenure.bound or tenure.kept):
                 self._state.count("orphans_freed")
                 told = self._state.tenures.told(tenure, self._state.now_ns)
-                yield Story("lock.orphan", f"{told}, freed: its client no longer wants it")
+                yield LogEvent("lock.orphan", f"{told}, freed: its client no longer wants it")
                 yield from self._state.tenures.remove(tenure, now_ns=self._state.now_ns)
         self._state.pins.drop_older(message.session, lowest)
         if self._state.standing.by_lane:
@@ -244,7 +244,7 @@ class SessionDesk:
         if found is not None:
             self._state.count("sessions_died")
             who = f"{found.actor or 'client'}@{found.host} pid {found.pid}"
-            yield Story("session.died", f"the process of {who} ended, session {found.session}")
+            yield LogEvent("session.died", f"the process of {who} ended, session {found.session}")
             yield from self.end(message.session, "its process died")
 
     def on_session_barred(self, message: SessionBarred, _: int) -> Iterator[Effect]:
@@ -252,7 +252,7 @@ class SessionDesk:
         found = self._state.sessions.by_id.get(message.session)
         if found is not None:
             self._state.count("sessions_barred")
-            yield Story("session.barred", f"{found.identity} is barred, session {found.session}")
+            yield LogEvent("session.barred", f"{found.identity} is barred, session {found.session}")
             yield from self.end(message.session, "its name may not use this shard any more")
 
     def end(self, session: str, cause: str) -> Iterator[Effect]:

@@ -41,8 +41,8 @@ from enact_dist.terms import ACCESSES
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
-    from enact_dist.core.shard.on_lock import LockDesk
-    from enact_dist.core.shard.on_prepare import PrepareDesk
+    from enact_dist.core.shard.on_lock import LockHandler
+    from enact_dist.core.shard.on_prepare import PrepareHandler
     from enact_dist.core.shard.state import ShardState
 
 VIEW_WAIT_NS: Final = 400_000_000
@@ -136,14 +136,14 @@ class Parked(Generic[T]):
         return None if first is None else first[0]
 
 
-class ViewDesk:
+class ViewHandler:
     """Everything about views without a lock.
 
     Attributes:
         waits: The views that wait for undecided commits.
     """
 
-    def __init__(self, state: ShardState, locks: LockDesk, prepares: PrepareDesk) -> None:
+    def __init__(self, state: ShardState, locks: LockHandler, prepares: PrepareHandler) -> None:
         self._state = state
         self._locks = locks
         self._prepares = prepares
@@ -278,14 +278,14 @@ class ViewDesk:
         return self._parked.next_end_ns()
 
 
-class StampDesk:
+class StampHandler:
     """Everything about waiting for commits that are not decided yet.
 
     Attributes:
         waits: The questions that wait for their stamp.
     """
 
-    def __init__(self, state: ShardState, prepares: PrepareDesk) -> None:
+    def __init__(self, state: ShardState, prepares: PrepareHandler) -> None:
         self._state = state
         self._prepares = prepares
         self._parked = Parked[AwaitStamp]()

@@ -45,10 +45,10 @@ from enact_dist.core.protocol.records import (
     NOTHING,
     Content,
     KeptRecord,
+    LogEvent,
     Record,
     Reply,
     SlotRecord,
-    Story,
     WorldDropped,
     WorldRecord,
 )
@@ -60,7 +60,7 @@ if TYPE_CHECKING:
 
     from enact_dist.core.protocol.messages import Answer
     from enact_dist.core.protocol.records import Effect
-    from enact_dist.core.shard.on_prepare import PrepareDesk
+    from enact_dist.core.shard.on_prepare import PrepareHandler
     from enact_dist.core.shard.state import ShardState
 
 FORK_WAIT_NS: Final = 400_000_000
@@ -87,14 +87,14 @@ class _Act:
     made: tuple[tuple[Slot, Content], ...] = ()
 
 
-class WorldDesk:
+class WorldHandler:
     """Everything about world contexts that are made of others, and about their end.
 
     Attributes:
         waits: The forks that wait for undecided commits.
     """
 
-    def __init__(self, state: ShardState, prepares: PrepareDesk) -> None:
+    def __init__(self, state: ShardState, prepares: PrepareHandler) -> None:
         self._state = state
         self._prepares = prepares
         self._waiting: dict[str, _Act] = {}
@@ -236,7 +236,7 @@ class WorldDesk:
         state.catalogue.drop_world(world)
         state.busy_worlds[world] = "being dropped"
         if state.asker:
-            yield Story("world.dropped", f"{state.asker} drops world context {world!r}")
+            yield LogEvent("world.dropped", f"{state.asker} drops world context {world!r}")
         dropped = WorldDropped(world, state.slots.version_base(world))
         yield from self._persist(act, (dropped, *self._labels_without(world)))
 

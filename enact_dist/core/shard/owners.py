@@ -46,7 +46,7 @@ from enact_dist.core.protocol.messages import (
     Request,
     Resolve,
 )
-from enact_dist.core.protocol.records import Effect, Event, Reply, Story
+from enact_dist.core.protocol.records import Effect, Event, LogEvent, Reply
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -159,5 +159,5 @@ class Quotas:
         text = f"{identity} has {bound} at this shard, which is all that one process may have"
         if identity not in self._told and len(self._told) < TOLD_MAX:
             self._told.add(identity)
-            yield Story("quota.refused", f"{text}; further refusals are only counted")
+            yield LogEvent("quota.refused", f"{text}; further refusals are only counted")
         yield Reply(reply_to, Refused("overload", f"{text}; end some, or wait for their end"))

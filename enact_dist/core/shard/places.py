@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.messages import ListPlaces, Places, ShardEntry
-from enact_dist.core.protocol.records import Call, Compare, Reply, Story
+from enact_dist.core.protocol.records import Call, Compare, LogEvent, Reply
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -25,7 +25,7 @@ PLACES_MAX: Final = 8
 PLACE_CHARACTERS_MAX: Final = 256
 
 
-class PlaceDesk:
+class PlaceHandler:
     """The places of all shards of the cell."""
 
     def __init__(self, state: ShardState) -> None:
@@ -55,12 +55,12 @@ class PlaceDesk:
             doubled[shard] = message.starts
             if before != message.starts:
                 self._state.count("namesakes_found")
-                yield Story("shard.namesakes", message.text, grave=True)
+                yield LogEvent("shard.namesakes", message.text, grave=True)
         elif before is not None:
             del doubled[shard]
             count = "one daemon answers" if message.starts else "no daemon answers"
             text = f"{count} for shard {shard} now; another one may be stopped or cut off"
-            yield Story("shard.alone", text)
+            yield LogEvent("shard.alone", text)
 
     def _all(self) -> tuple[ShardEntry, ...]:
         """Return the places of this shard's own file, then those that others have named."""

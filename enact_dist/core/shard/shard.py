@@ -80,13 +80,13 @@ from enact_dist.core.protocol.records import (
 )
 from enact_dist.core.rights.rules import Rights
 from enact_dist.core.shard import inspection, owners
-from enact_dist.core.shard.on_history import HistoryDesk, LineageDesk
-from enact_dist.core.shard.on_lock import LockDesk
-from enact_dist.core.shard.on_prepare import PrepareDesk
-from enact_dist.core.shard.on_session import SessionDesk
-from enact_dist.core.shard.on_view import StampDesk, ViewDesk
-from enact_dist.core.shard.on_world import WorldDesk
-from enact_dist.core.shard.places import PlaceDesk
+from enact_dist.core.shard.on_history import HistoryHandler, LineageHandler
+from enact_dist.core.shard.on_lock import LockHandler
+from enact_dist.core.shard.on_prepare import PrepareHandler
+from enact_dist.core.shard.on_session import SessionHandler
+from enact_dist.core.shard.on_view import StampHandler, ViewHandler
+from enact_dist.core.shard.on_world import WorldHandler
+from enact_dist.core.shard.places import PlaceHandler
 from enact_dist.core.shard.state import ShardSettings, ShardState
 from enact_dist.core.state.audit import BROKEN, SETTLED
 from enact_dist.core.state.grants import HELD_TOO_LONG
@@ -109,15 +109,15 @@ class Shard:
     ) -> None:
         self.state = ShardState(settings, recovered, now_ns=now_ns, wall_ns=wall_ns)
         self.settings, self.epoch = settings, self.state.epoch
-        self._sessions = SessionDesk(self.state)
-        self._prepares = PrepareDesk(self.state, recovered.prepared, recovered.forced)
-        self._locks = LockDesk(self.state, self._prepares)
-        self._history = HistoryDesk(self.state, self._sessions, self._prepares)
-        self._views = ViewDesk(self.state, self._locks, self._prepares)
-        self._worlds = WorldDesk(self.state, self._prepares)
-        self._places = PlaceDesk(self.state)
-        lineage = LineageDesk(self.state)
-        self._stamps = StampDesk(self.state, self._prepares)
+        self._sessions = SessionHandler(self.state)
+        self._prepares = PrepareHandler(self.state, recovered.prepared, recovered.forced)
+        self._locks = LockHandler(self.state, self._prepares)
+        self._history = HistoryHandler(self.state, self._sessions, self._prepares)
+        self._views = ViewHandler(self.state, self._locks, self._prepares)
+        self._worlds = WorldHandler(self.state, self._prepares)
+        self._places = PlaceHandler(self.state)
+        lineage = LineageHandler(self.state)
+        self._stamps = StampHandler(self.state, self._prepares)
         self._handlers: dict[type, Callable[..., Iterable[Effect]]] = {
             Hello: self._sessions.on_hello,
             Register: self._sessions.on_register,
@@ -226,7 +226,7 @@ class Shard:
             elif guard is None or not guard.denials:
                 state.count("requests_refused")
         if guard is not None and guard.denials:
-            effects += guard.stories(now_ns, wall_ns)
+            effects += guard.log_events(now_ns, wall_ns)
         if self._stamps.waits and not state.stored:
             effects += self._stamps.answer_reached()
         if self._views.waits or self._worlds.waits:
@@ -305,11 +305,11 @@ class Shard:
             )
             if soonest is not None
         ]
-        for desk in (
+        for handler in (
             self._prepares, self._stamps, self._views, self._worlds, state.decisions,
             state.standing,
         ):  # fmt: skip
-            due_ns = desk.next_deadline_ns()
+            due_ns = handler.next_deadline_ns()
             if due_ns is not None:
                 deadlines.append(due_ns)
         return min(deadlines)

@@ -1,7 +1,7 @@
-"""The parts of one shard that its desks work on, and the few acts that they share.
+"""The parts of one shard that its handlers work on, and the few acts that they share.
 
 `ShardState` decides nothing by itself; `Shard` sets its time before each message and hands it to
-the desk that the message is for.
+the handler that the message is for.
 """
 
 from __future__ import annotations

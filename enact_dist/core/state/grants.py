@@ -34,7 +34,7 @@ from enact_dist.core.protocol.messages import (
     Item,
     Waiting,
 )
-from enact_dist.core.protocol.records import Effect, PreparedRecord, Reply, Story
+from enact_dist.core.protocol.records import Effect, LogEvent, PreparedRecord, Reply
 from enact_dist.core.state.clock import DueTimes, Latencies
 from enact_dist.core.state.lock_table import LockTable, Mode
 from enact_dist.core.state.slots import SlotMap
@@ -357,7 +357,7 @@ class Tenures:
         elif session is not None and tenure.token is not None:
             session.lane(tenure.lock.lane).ended = (tenure.lock, cause)
         if not self.kept.is_unused(tenure):  # else no block loses anything
-            yield Story("lock.taken", f"{self.told(tenure, now_ns)}: {cause}")
+            yield LogEvent("lock.taken", f"{self.told(tenure, now_ns)}: {cause}")
         yield from self.remove(tenure, now_ns=now_ns)
 
     def describe(self, tenure: Tenure, now_ns: int) -> Holder:

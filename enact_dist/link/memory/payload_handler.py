@@ -7,8 +7,8 @@
     Commit, Prepare ───┴──> adopted: read-only, its bytes become the body of the datum
     last datum gone ──────> the file is removed; processes that have mapped it keep its content
 
-The desk works in front of the shard: the core sees bodies and never learns where they are stored.
-A payload lasts as long as its bytes are in use, a draft as long as its client.
+The handler works in front of the shard: the core sees bodies and never learns where they are
+stored.  A payload lasts as long as its bytes are in use, a draft as long as its client.
 Files that a client will ask for are made ahead (`link.memory.ahead`); they are drafts, too.
 
 Rules that a change must keep:
@@ -65,7 +65,7 @@ GAPS_MAX: Final = 1024
 DRAFT_NS: Final = 30_000_000_000
 """A draft of a session without a lock is dropped after this time without a slice."""
 FULL_NS: Final = 100_000_000
-"""After a payload did not fit, the desk frees no room for one as large during this time."""
+"""After a payload did not fit, the handler frees no room for one as large during this time."""
 ROOM_S: Final = 1.0
 """How long a new draft waits for files that are being removed."""
 SILENT_NS: Final = 60_000_000_000
@@ -76,7 +76,7 @@ ROOM_TRIES: Final = 8
 _log = logging.getLogger("enact.shard")
 
 
-class PayloadDesk:
+class PayloadHandler:
     """The payloads of one shard.  Thread-safe; never waits for the shard.
 
     Args:

@@ -235,7 +235,7 @@ class Scenario:
         self.world.run_until(self.world.now_ns + 2 * DRAFT_NS)
         self._check_quiet()
         for shard in self.shards.values():
-            for file in shard.payloads.desk.drafts():
+            for file in shard.payloads.handler.drafts():
                 self.world.violation("I12 nothing is left", shard.name, file)
 
     def _wind_down(self) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from enact_dist.cli import main
-from enact_dist.core.protocol.records import Effect, Persist, Story
+from enact_dist.core.protocol.records import Effect, LogEvent, Persist
 from enact_dist.link.lease import AnswerGate
 from enact_dist.link.postgres import opening
 from enact_dist.link.postgres.address import FreeShard
@@ -22,7 +22,7 @@ from enact_dist.verify.chaos.replicated.answers import AnswerTimes
 
 MODULE: Final = "enact_dist.verify.chaos.replicated.daemon"
 FENCED: Final = "fenced "
-_INSIDE: Final = (Persist, Story)
+_INSIDE: Final = (Persist, LogEvent)
 """Effects that reach no client and no other shard."""
 
 

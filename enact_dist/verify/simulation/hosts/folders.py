@@ -1,8 +1,9 @@
 """The shared folders of simulated hosts, and what clients do with their files.
 
 The names are simulated, and the files are the kernel's own: it maps them, it keeps what is mapped
-when a name goes, and parent and child of a fork share what is open.  What the desk of a shard and
-its clients decide over them is real: `PayloadDesk`, `NamesAhead`, `SharedPayloads` and `Draft`.
+when a name goes, and parent and child of a fork share what is open.  What the handler of a shard
+and its clients decide over them is real: `PayloadHandler`, `NamesAhead`, `SharedPayloads` and
+`Draft`.
 
 A folder belongs to one life of its shard.  When the shard is killed its files stay until the next
 start removes them; a power cut takes them at once.  Some clients are on another host and see none.

@@ -1,14 +1,14 @@
 """Large data that travel apart from their commits, on a bad network: both ends, and their judge.
 
-Each simulated shard has a real `PayloadDesk`, new with each start.  In some runs it has a folder,
-in which clients fill files (`hosts.folders`); otherwise it keeps plain memory.  Clients bring
-some of their large data in slices, which are lost, doubled, late and cut off by crashes; some name
-a payload of which only a part has come, or nothing.  Whatever happens, a commit has all of its
+Each simulated shard has a real `PayloadHandler`, new with each start.  In some runs it has a
+folder, in which clients fill files (`hosts.folders`); otherwise it keeps plain memory.  Clients
+bring some of their large data in slices, which are lost, doubled, late and cut off by crashes; some
+name a payload of which only a part has come, or nothing.  Whatever happens, a commit has all of its
 bytes, and a payload is gone as soon as nothing of its shard shows it any more.  A draft ends with
 its session, or, where the session holds no lock, after 30 s of its shard without a slice.
 
 Of a folder: what a commit publishes is what its client has written, and stays that; every file
-belongs to a draft or to data that are still shown; what the desk counts is what is there.
+belongs to a draft or to data that are still shown; what the handler counts is what is there.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from enact_dist.core.protocol.datum import Datum
 from enact_dist.core.protocol.messages import Commit, EpochChanged, Prepare, Stage, Staged
 from enact_dist.core.protocol.records import Persist, PreparedRecord, SlotRecord
 from enact_dist.link.memory.maps import Pages, PlainMemory, leftovers
-from enact_dist.link.memory.payload_desk import PayloadDesk
+from enact_dist.link.memory.payload_handler import PayloadHandler
 from enact_dist.verify.simulation.hosts.world import MS, Host, S
 from enact_dist.wire.limits import PAYLOAD_BYTES_MIN
 
@@ -76,7 +76,7 @@ class ShardPayloads:
         self._written, self._folder, self._folders = folders.written, folder, folders
         self._needs = self._world.schedule.place(f"{host.name}-room")
         bytes_max = BYTES_MAX if folder is None else folders.bytes_max
-        self.desk = PayloadDesk(folder, bytes_max, firm=folders.firm, clock=HostClock(host))
+        self.handler = PayloadHandler(folder, bytes_max, firm=folders.firm, clock=HostClock(host))
         self._adopted: dict[str, weakref.ref[Pages | PlainMemory]] = {}
         self._drafts: dict[str, tuple[str, int, int]] = {}
         """Of each draft its session, its first and its newest slice, by the shard's clock."""
@@ -86,11 +86,11 @@ class ShardPayloads:
         if message.total and message.session not in self._shard.state.sessions.by_id:
             return EpochChanged(self._shard.epoch)
         self._world.tally["slices staged"] += 1
-        answer = self.desk.stage(message)
+        answer = self.handler.stage(message)
         file, now_ns = message.file, self._host.local_ns
         if not message.total:
             self._world.tally["drafts dropped"] += self._drafts.pop(file, None) is not None
-        elif isinstance(answer, Staged) and file in self.desk.drafts():
+        elif isinstance(answer, Staged) and file in self.handler.drafts():
             _, begun_ns, _ = self._drafts.get(file, ("", now_ns, now_ns))
             self._drafts[file] = message.session, begun_ns, now_ns
         return answer
@@ -103,9 +103,9 @@ class ShardPayloads:
         message = replace(message, writes=bare)
         found: Commit | Prepare
         if isinstance(message, Commit):
-            found = self.desk.with_bodies(message)
+            found = self.handler.with_bodies(message)
         else:
-            found = self.desk.with_bodies(message)
+            found = self.handler.with_bodies(message)
         for before, after in zip(message.writes, found.writes, strict=True):
             memory = _memory_of(after.datum)
             if before.datum is None or not before.datum.file or memory is None:
@@ -129,7 +129,7 @@ class ShardPayloads:
         """Make files that clients will ask for, as the shard's link does after an answer."""
         if self._folder is not None:
             self._folder.ahead = True
-            self.desk.make_ahead()
+            self.handler.make_ahead()
             self._folder.ahead = False
             bits, fault = self._needs.next(), self._needs.fault
             needed = (bits & 0xFFFF) < self._folders.needed * 0x10000
@@ -140,22 +140,22 @@ class ShardPayloads:
 
     def _need_room(self, fault: str, luck: Random) -> None:
         """Let another client ask for room that files ahead have, and give it up at once."""
-        figures, size = self.desk.figures(), PAYLOAD_BYTES_MIN + 1
+        figures, size = self.handler.figures(), PAYLOAD_BYTES_MIN + 1
         if figures["files_ahead"]:
             files = luck.randint(1, figures["files_ahead"])
             total = figures["payload_bytes_max"] - figures["payload_bytes"] + files * size
             self._world.befell(fault, f"{files} files ahead of {self._host.name} make room")
             file = f"{OTHER}-{fault.rpartition('.')[2]}"
-            self.desk.stage(Stage(OTHER, file, 0, total, Datum(b"", b"", 0)))
-            self.desk.drop(file)
+            self.handler.stage(Stage(OTHER, file, 0, total, Datum(b"", b"", 0)))
+            self.handler.drop(file)
             leftovers().wait(60.0)  # a large file is freed by a thread
 
     def look(self) -> None:
         """Give up drafts as the shard's link does at each tick: those that must end, no others."""
         state, now_ns = self._shard.state, self._host.local_ns
         sessions, before = state.sessions.by_id, self._holders()
-        self.desk.sweep(sessions.__contains__, state.tenures.works)
-        left, after = self.desk.drafts(), self._holders()
+        self.handler.sweep(sessions.__contains__, state.tenures.works)
+        left, after = self.handler.drafts(), self._holders()
         for file in left:
             if file in self._adopted:
                 self._world.violation("a payload is made once", file)
@@ -171,7 +171,7 @@ class ShardPayloads:
                 self._world.tally["drafts given up for want of slices"] += 1
             if over and file in left:
                 self._world.violation(over, file)
-            if not over and file not in left and not self.desk.counters.get("drafts_displaced"):
+            if not over and file not in left and not self.handler.counters.get("drafts_displaced"):
                 self._world.violation("a draft stays while its client may commit it", file)
             if over or file not in left:
                 del self._drafts[file]
@@ -184,7 +184,7 @@ class ShardPayloads:
         """A folder has the files that may still be used, and as many as are counted."""
         if self._folder is None:
             return
-        names, figures = self._folder.names(), self.desk.figures()
+        names, figures = self._folder.names(), self.handler.figures()
         held = {file for file, adopted in self._adopted.items() if adopted() is not None}
         if not names <= held.union(drafts):
             self._world.violation("no file is left", names.difference(held, drafts))
@@ -194,17 +194,17 @@ class ShardPayloads:
 
     def end(self) -> None:
         """End with the process, which closes nothing."""
-        figures = self.desk.figures()
+        figures = self.handler.figures()
         self.tally_counters()
         self._world.tally["files ahead at a crash"] += figures["files_ahead"]
         if self._folder is not None:
             self._folder.abandon()
-        self.desk.sweep(lambda _: False, lambda _: False)  # as the kernel takes its memory
+        self.handler.sweep(lambda _: False, lambda _: False)  # as the kernel takes its memory
 
     def tally_counters(self) -> None:
-        """Add the counters of the desk to the tally of the run."""
-        for name, count in self.desk.counters.items():
-            self._world.tally[f"desk: {name}"] += count
+        """Add the counters of the handler to the tally of the run."""
+        for name, count in self.handler.counters.items():
+            self._world.tally[f"handler: {name}"] += count
 
     def _holders(self) -> set[str]:
         """Return the sessions with a lock, other than kept grants that they do not use."""
@@ -220,7 +220,7 @@ class ShardPayloads:
             held.add(id(_memory_of(datum)))
             if datum is not None and datum.file:
                 self._check_written(datum.file, datum)
-        self.desk.sweep(lambda _: False, lambda _: False)
+        self.handler.sweep(lambda _: False, lambda _: False)
         self._check_folder(())
         for file, adopted in self._adopted.items():
             memory = adopted()

@@ -213,7 +213,7 @@ class ShardNode(ShardPlace):
 
     def _make_ahead(self) -> None:
         """Make the files that are wanted ahead, in a moment: clients meet none, some or all."""
-        if self.payloads.desk.wants_ahead:
+        if self.payloads.handler.wants_ahead:
             self.later(self._ahead.choice(AHEAD_NS), self.payloads.make_ahead)
 
     def event(self, event: Event) -> None:
