@@ -185,7 +185,7 @@ def test_a_camera_repeats_its_image_until_its_time_is_over(tmp_path, monkeypatch
         session = world.session.client.core.session
         row = {"name": "one", "state": "running", "words_in": "online"}
         info = types.SimpleNamespace(
-            session=session, silent=False, report={"actors": [row]}, names=lambda: {"one"}
+            session=session, silent=False, rows=lambda: [row], names=lambda: {"one"}
         )
         monkeypatch.setattr(cell, "actors", lambda: [info])
         taken = []
