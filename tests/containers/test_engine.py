@@ -24,7 +24,7 @@ def test_an_engine_dies_with_its_tests_and_leaves_nothing(engine):
     """Even when they are killed: the next start removes the folder."""
     tests = subprocess.Popen(
         [sys.executable, "-c", OTHER],
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
