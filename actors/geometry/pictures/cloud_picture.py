@@ -32,7 +32,7 @@ EDGE_IGNORED: Final = 0.004
 """Relative step in depth that is no edge: splats on a slanted face make such steps."""
 
 EDGE_STRENGTH: Final = 60.0
-"""Darkening per relative step in depth; found by eye on a handler scene at 1 m."""
+"""Darkening per relative step in depth; found by eye on a desk scene at 1 m."""
 
 
 def draw_points(
