@@ -315,13 +315,12 @@ class Page:
     def _on_datum(self, name: str) -> None:
         found = [slot for slot in self._rows() if markup.slot_name(slot) == name]
         self._datum = found[0] if found else None
-        if self._datum is not None and self._is_small(self._datum):
-            self._send("history", self._datum)  # after the datum itself is shown
+        self._send("history", self._datum)  # after the datum itself is shown
 
-    def _on_history(self, slot: Slot) -> None:
+    def _on_history(self, slot: Slot | None) -> None:
         """Ask for a history beside the page, one at a time: a recording is read through for it."""
-        if self._learning:
-            return  # the newest choice follows
+        if self._learning or slot is None or not self._is_small(slot):
+            return  # the newest choice follows what is asked for already
         self._learning = True
         ask = partial(self._ask_history, slot)
         threading.Thread(target=ask, name="view history", daemon=True).start()
@@ -338,8 +337,8 @@ class Page:
     def _on_learned(self, answer: tuple[Slot, Any]) -> None:
         slot, found = answer
         self._learning = False
-        if self._datum not in (None, slot):
-            self._on_datum(markup.slot_name(self._datum))
+        if self._datum != slot:
+            self._send("history", self._datum)
         if isinstance(found, Exception):
             raise found
         self._samples.learn(slot, found)
