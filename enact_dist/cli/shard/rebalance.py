@@ -96,13 +96,13 @@ def _folders(config: CellConfig, stores: dict[str, str], new: list[str]) -> dict
 
 def _name_others(config: CellConfig, folders: dict[str, Path]) -> None:
     """Say where else entities lie: a shard that has left the cell must be named to be emptied."""
-    from enact_dist.link.folder.folder import ASIDE, holds_store
+    from enact_dist.link.folder.folder import stores_in
     from enact_dist.link.store.store import read_store
 
     parent = config.data_folder
     known = {folder.resolve() for folder in folders.values()}
-    for path in sorted(parent.iterdir()) if parent is not None and parent.is_dir() else ():
-        if path.resolve() in known or not holds_store(path) or ASIDE in path.name:
+    for path in stores_in(parent) if parent is not None and parent.is_dir() else ():
+        if path.resolve() in known:
             continue
         with suppress(StoreError), read_store(path) as stored:
             count = len({record.slot.entity for record in stored.slots})

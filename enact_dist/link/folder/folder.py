@@ -111,8 +111,8 @@ def warn_of_others(folder: Path, shard: str, placement: PlacementMap) -> None:
     """
     names = {folder.name, *(entry.name for entry in placement.shards)}
     with contextlib.suppress(OSError):
-        for path in sorted(folder.parent.iterdir()):
-            if path.name not in names and ASIDE not in path.name and holds_store(path):
+        for path in stores_in(folder.parent):
+            if path.name not in names:
                 _log.warning(
                     "shard %s starts without data, and %s has data of a shard that cell.toml does"
                     " not name: if that was renamed or has left the cell, stop the cell and move"
@@ -166,6 +166,17 @@ def _accept(folder: Path, what: str, first: str = "") -> str:
         f"restore the whole folder from a backup; or, to go on {what}, keep a copy of the folder,"
         f" {first}make an empty file '{folder / ACCEPT_LOSS_FILE}', and start the shard"
     )
+
+
+def stores_in(parent: Path) -> list[Path]:
+    """Return the folders of shards in a folder, sorted, without those that were put aside.
+
+    Raises:
+        OSError: The folder cannot be read.
+    """
+    return [
+        path for path in sorted(parent.iterdir()) if ASIDE not in path.name and holds_store(path)
+    ]
 
 
 def holds_store(folder: Path) -> bool:
