@@ -135,14 +135,13 @@ class Triggered:
 
     __exit__ = Leaves()
     _open: ref[Any] | None = None
+    _entity: Entity | None = None
+    _tick_ns = 0
+    _newer: Newer | None = None
 
     def _is_abandoned(self) -> bool:
         """Whether the ``with`` statement has ended without `__exit__`; see `Leaves`."""
         return self._open is not None and self._open() is None
-
-    _entity: Entity | None = None
-    _tick_ns = 0
-    _newer: Newer | None = None
 
     @property
     def entity(self) -> Entity:
