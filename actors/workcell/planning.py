@@ -238,7 +238,7 @@ class Search:
     def is_news(self, found: Plan, last: Path | None) -> bool:
         """Return whether what was found replaces the last path.
 
-        That there is no way is said once; and it is no reason to leave a path that is still free.
+        A path says once that there is no way; that alone replaces no path that is still free.
         """
         if len(found.waypoints) or last is None:
             return True

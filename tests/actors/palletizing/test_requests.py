@@ -32,7 +32,7 @@ def flag(verdict, *, x_m=0.0, captured_ns=9):
 
 
 def situation(**known):
-    """A cell that has placed one package; what else is known is said by the test."""
+    """A cell that has placed one package; each test adds what else the cell knows."""
     results = {"place/0": PLACED}
     pushed = np.array([1.0, 0.0, 0.0])
     nothing = dict.fromkeys(("request", "sight", "outcome", "look", "grip", "gripper", "decision"))
