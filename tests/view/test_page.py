@@ -1,5 +1,6 @@
 """A page and its server, without a browser: its thread, its bounds, its moments."""
 
+import asyncio
 import socket
 import threading
 import time
@@ -17,7 +18,9 @@ from enact_dist.errors import ConfigError
 from enact_dist.view.activity import CellActivity
 from enact_dist.view.catalogue import ListedState, SlotCatalogue
 from enact_dist.view.pages import page as pages
+from enact_dist.view.pages.comparing import MARKED
 from enact_dist.view.pages.page import Page
+from enact_dist.view.pages.panels import NONE
 from enact_dist.view.pages.server import free_port
 from enact_dist.view.pages.texts import row_of
 from enact_dist.view.pages.viewer import Viewer, ViewSettings
@@ -79,6 +82,41 @@ def test_rows_are_shown_again_as_soon_as_their_values_come(page, monkeypatch):
     page._send("filter", "speed")
     handles = page._client.gui.handles
     until(lambda: any("<b>arm/speed</b> 0.5" in str(h.content) for h in [*handles.values()]))
+
+
+def test_a_choice_outlives_a_tick_that_begins_before_it_is_heard(page, monkeypatch):
+    """What a page sets meanwhile is what it knew before."""
+    shown = []
+    monkeypatch.setattr(page, "_show_status", lambda *_: shown.append(1))
+    monkeypatch.setattr(pages, "LISTED_S", 0.0)
+    page.contents.marked_ns = 1
+    page.start()
+    handles = page._client.gui.handles
+    until(lambda: "compare with" in handles and MARKED in handles["compare with"].options)
+    handle = handles["compare with"]
+    handle.value = MARKED
+    before = len(shown)
+    until(lambda: len(shown) > before + 1)
+    assert handle.value == MARKED
+    asyncio.run(handle.act(SimpleNamespace(client_id=0, target=handle)))
+    until(lambda: page.contents.comparing.against == MARKED)
+    page._send("against", "")
+    until(lambda: handle.value == NONE)
+
+
+def test_a_history_comes_when_the_size_of_its_datum_does(page, monkeypatch):
+    """A datum can be chosen before its size is known."""
+    sizes, asked = {}, []
+    monkeypatch.setattr(page._viewer, "size", lambda slot: sizes.get(slot.aspect))
+    monkeypatch.setattr(page._viewer.source, "samples", lambda slot, *_: asked.append(slot) or [])
+    page.start()
+    handles = page._client.gui.handles
+    until(lambda: "datum" in handles and "arm/pose" in handles["datum"].options)
+    page._send("datum", "arm/pose")
+    until(lambda: any("<b>online:arm/pose</b>" in str(h.content) for h in [*handles.values()]))
+    assert asked == []
+    sizes["pose"] = 8
+    until(lambda: [slot.aspect for slot in asked] == ["pose"])
 
 
 def test_a_page_goes_on_while_a_history_is_read(page, monkeypatch):

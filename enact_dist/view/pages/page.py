@@ -29,7 +29,10 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.datum import Slot
     from enact_dist.view.catalogue import Listing
     from enact_dist.view.drawing.scene import SceneView, ShownDatum
+    from enact_dist.view.pages.panels import Input
     from enact_dist.view.pages.viewer import Viewer
+
+    _Event = tuple[str, Any, Input | None]
 
 _log = logging.getLogger(__name__)
 
@@ -54,7 +57,7 @@ class Page:
 
     def __init__(self, viewer: Viewer, client: ClientHandle) -> None:
         self._viewer, self._client = viewer, client
-        self._events: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
+        self._events: queue.SimpleQueue[_Event] = queue.SimpleQueue()
         self._closed = False
         self.contents = PageContents(viewer.feed, viewer.source.of_page(), viewer.compare)
         self._canvas = Canvas(client)
@@ -66,6 +69,7 @@ class Page:
         self._listed_s = self._ticked_s = 0.0
         self._lacking: list[Slot] = []
         self._learning = False
+        self._learned: Slot | None = None
         self._fits = 2
         self._begun_s = self._acted_s = time.monotonic()
         self._draws: deque[float] = deque()
@@ -79,12 +83,12 @@ class Page:
     def close(self) -> None:
         """End; returns at once."""
         self._closed = True
-        self._events.put(("", None))
+        self._send("", None)
 
     # ------------------------------------------------------------ the thread
 
-    def _send(self, name: str, value: Any) -> None:
-        self._events.put((name, value))
+    def _send(self, name: str, value: Any, source: Input | None = None) -> None:
+        self._events.put((name, value, source))
 
     def _run(self) -> None:
         stand_back(self._thread.name)
@@ -112,10 +116,12 @@ class Page:
                 return
             while not self._events.empty():
                 events.append(self._events.get())
-            newest = {name for name, _ in events if name == "seconds"}
-            for at, (name, value) in enumerate(events):
-                later = (other for other, _ in events[at + 1 :])
+            newest = {name for name, *_ in events if name == "seconds"}
+            for at, (name, value, source) in enumerate(events):
+                later = (other for other, *_ in events[at + 1 :])
                 if name and not (name in newest and name in later):
+                    if source is not None:
+                        source.taken()
                     self._said, self._listed_s = "", 0.0
                     act = getattr(self, f"_on_{name.replace(' ', '_')}")
                     self._said = self._guarded(act, value) or self._said
@@ -186,6 +192,7 @@ class Page:
                 self._show_panels(data)
         if listing_due and player.live and not self._fills:
             contents.learn_history(self._of_history())
+        self._ask_for_history()
 
     @property
     def _begins(self) -> bool:
@@ -315,17 +322,21 @@ class Page:
     def _on_datum(self, name: str) -> None:
         found = [slot for slot in self._rows() if markup.slot_name(slot) == name]
         self._datum = found[0] if found else None
-        self._send("history", self._datum)  # after the datum itself is shown
+        self._learned = None
 
-    def _on_history(self, slot: Slot | None) -> None:
-        """Ask for a history beside the page, one at a time: a recording is read through for it."""
-        if self._learning or slot is None or not self._is_small(slot):
-            return  # the newest choice follows what is asked for already
-        self._learning = True
-        ask = partial(self._ask_history, slot)
+    def _ask_for_history(self) -> None:
+        """Ask for the chosen datum's beside the page, one at a time: a recording is read through.
+
+        It waits for the datum's size, and until the datum itself is shown.
+        """
+        slot = self._datum
+        if slot is None or slot == self._learned or self._learning or not self._is_small(slot):
+            return
+        self._learning, self._learned = True, slot
+        ask = partial(self._read_history, slot)
         threading.Thread(target=ask, name="view history", daemon=True).start()
 
-    def _ask_history(self, slot: Slot) -> None:
+    def _read_history(self, slot: Slot) -> None:
         stand_back("view history")
         found: object
         try:
@@ -337,8 +348,6 @@ class Page:
     def _on_learned(self, answer: tuple[Slot, Any]) -> None:
         slot, found = answer
         self._learning = False
-        if self._datum != slot:
-            self._send("history", self._datum)
         if isinstance(found, Exception):
             raise found
         self._samples.learn(slot, found)

@@ -3,35 +3,53 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from viser import ClientHandle
-
-    Events = Callable[[str, Any], None]
-    """Takes the name of an event and its value; returns at once."""
 
 NONE: Final = "-"
 """The option of a list that stands for no choice."""
 SPEEDS: Final = ("0.1", "0.25", "0.5", "1", "2", "5", "10")
 
 
-def listen(handle: Any, send: Events, name: str) -> None:
-    """Send what a person sets, not what the page itself sets."""
+class Send(Protocol):
+    """Takes the name of an event, its value and the input that it comes from; returns at once."""
 
-    def changed(event: Any) -> None:
+    def __call__(self, name: str, value: Any, source: Input | None = None) -> None:
+        """Take it."""
+
+
+class Input:
+    """An input of the page, which a person sets, and the page, too.
+
+    What a person has set stays until the page has taken it: a tick in between would set back
+    what the page knows.
+    """
+
+    def __init__(self, handle: Any, send: Send, name: str) -> None:
+        self._handle, self._send, self._name = handle, send, name
+        self.known = handle.value
+        handle.on_update(self._changed)
+
+    async def _changed(self, event: Any) -> None:
+        """Send what a person sets, not what the page itself sets; in order, as it is awaited."""
         if event.client_id is not None:
-            send(name, event.target.value)
+            self._send(self._name, self._value_of(event.target.value), self)
 
-    handle.on_update(changed)
+    def _value_of(self, value: Any) -> Any:
+        return value
 
+    def taken(self) -> None:
+        """The page has taken what a person has set."""
+        self.known = self._handle.value
 
-def put(handle: Any, value: object) -> None:
-    """Set an input, if it has another value."""
-    if handle.value != value:
-        handle.value = value
+    def put(self, value: object) -> None:
+        """Set it, if the page knows another value."""
+        if self.known != value:
+            self.known = self._handle.value = value
 
 
 class Text:
@@ -46,13 +64,15 @@ class Text:
             self._handle.content = self._content = content
 
 
-class Choice:
+class Choice(Input):
     """A list to choose from whose options change."""
 
-    def __init__(self, gui: Any, label: str, send: Events, name: str) -> None:
-        self._handle = gui.add_dropdown(label, (NONE,))
+    def __init__(self, gui: Any, label: str, send: Send, name: str) -> None:
+        super().__init__(gui.add_dropdown(label, (NONE,), initial_value=NONE), send, name)
         self._options: tuple[str, ...] = (NONE,)
-        listen(self._handle, lambda event, value: send(event, "" if value == NONE else value), name)
+
+    def _value_of(self, value: Any) -> Any:
+        return "" if value == NONE else value
 
     def show(self, options: Sequence[str], chosen: str) -> None:
         """Show options, and which of them is chosen; "": none."""
@@ -62,25 +82,22 @@ class Choice:
         if wanted != self._options:
             self._options = wanted
             self._handle.options = wanted
-        if self._handle.value != (chosen or NONE):
-            self._handle.value = chosen or NONE
+        self.put(chosen or NONE)
 
 
 class TimePanel:
     """Now, or a moment of the past; play, step, mark and compare."""
 
-    def __init__(self, client: ClientHandle, send: Events, *, live: bool) -> None:
+    def __init__(self, client: ClientHandle, send: Send, *, live: bool) -> None:
         gui = client.gui
         self._where = Text(gui)
-        self._live = gui.add_checkbox("live", live, disabled=not live)
-        listen(self._live, send, "live")
+        self._live = Input(gui.add_checkbox("live", live, disabled=not live), send, "live")
         self._slider = gui.add_slider("seconds", 0.0, 1.0, 0.001, 0.0)
-        listen(self._slider, send, "seconds")
+        self._seconds = Input(self._slider, send, "seconds")
         steps = gui.add_button_group("commit", ("previous", "next"))
         steps.on_click(lambda event: send("step", -1 if event.target.value == "previous" else 1))
-        self._playing = gui.add_checkbox("play", initial_value=False)
-        listen(self._playing, send, "play")
-        listen(gui.add_dropdown("speed", SPEEDS, initial_value="1"), send, "speed")
+        self._playing = Input(gui.add_checkbox("play", initial_value=False), send, "play")
+        Input(gui.add_dropdown("speed", SPEEDS, initial_value="1"), send, "speed")
         gui.add_button("mark this moment").on_click(lambda _: send("mark", None))
         self._against = Choice(gui, "compare with", send, "against")
         self._difference = Text(gui)
@@ -88,8 +105,8 @@ class TimePanel:
     def show(self, where: str, *, live: bool, playing: bool) -> None:
         """Show which moment the page shows."""
         self._where.show(where)
-        put(self._live, live)
-        put(self._playing, playing)
+        self._live.put(live)
+        self._playing.put(playing)
 
     @property
     def high_s(self) -> float:
@@ -100,10 +117,10 @@ class TimePanel:
         """Show how far back the slider goes, and where it is."""
         high = max(0.001, round(span_s, 3))
         if self._slider.max != high:
-            put(self._slider, min(self._slider.value, high))
+            self._seconds.put(min(self._seconds.known, high))
             self._slider.max = high
-        if abs(self._slider.value - seconds) > 5e-4:
-            put(self._slider, min(round(seconds, 3), high))
+        if abs(self._seconds.known - seconds) > 5e-4:
+            self._seconds.put(min(round(seconds, 3), high))
 
     def compare(self, options: Sequence[str], chosen: str, difference: str) -> None:
         """Show with what the moment is compared, and how the two differ."""
@@ -114,12 +131,11 @@ class TimePanel:
 class TreePanel:
     """World contexts, entities and data; a filter; what is drawn."""
 
-    def __init__(self, client: ClientHandle, send: Events) -> None:
+    def __init__(self, client: ClientHandle, send: Send) -> None:
         self._gui, self._send = client.gui, send
         self._world = Choice(client.gui, "world context", send, "world")
-        listen(
-            client.gui.add_text("filter", "", hint="part of a name, or a pattern"), send, "filter"
-        )
+        wanted = client.gui.add_text("filter", "", hint="part of a name, or a pattern")
+        Input(wanted, send, "filter")
         self._place = Text(client.gui)
         self._branches = client.gui.add_folder("entities")
         self._buttons: list[Any] = []
@@ -130,7 +146,7 @@ class TreePanel:
         self._boxes: dict[str, Any] = {}
         with self._layers:
             self._label = Choice(client.gui, "labels", send, "label")
-            listen(client.gui.add_checkbox("trails of poses", initial_value=True), send, "trails")
+            Input(client.gui.add_checkbox("trails of poses", initial_value=True), send, "trails")
             client.gui.add_button("fit the view").on_click(lambda _: send("fit", None))
 
     def show_worlds(self, worlds: Sequence[str], chosen: str) -> None:
@@ -177,7 +193,7 @@ class TreePanel:
 class DatumPanel:
     """The chosen datum: value, plot, causes and effects, pins and downloads."""
 
-    def __init__(self, client: ClientHandle, send: Events, *, cell: bool) -> None:
+    def __init__(self, client: ClientHandle, send: Send, *, cell: bool) -> None:
         gui = client.gui
         self._value = Text(gui)
         files = gui.add_button_group("download", ("PNG", "PLY", *(("MCAP",) if cell else ())))
