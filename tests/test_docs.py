@@ -6,6 +6,7 @@ the language `console`, and files that they need, are followed in `tests/e2e/tes
 """
 
 import ast
+import pkgutil
 import re
 import shlex
 import subprocess
@@ -179,6 +180,8 @@ def test_toml_of_a_page_can_be_read(block, tmp_path):
     if "shards" in there and block.file != "misspelt.toml":
         (tmp_path / "cell.toml").write_text(block.text, "utf-8")
         load_config(tmp_path / "cell.toml", environment={})
+    for name in re.findall(r'^\s*class = "(actors\.[\w.]+:\w+)"', block.text, re.MULTILINE):
+        assert pkgutil.resolve_name(name)
 
 
 @pytest.mark.parametrize("page", ALL, ids=lambda page: str(page.relative_to(ROOT)))
@@ -284,6 +287,15 @@ def test_tests_that_the_page_on_the_proof_names_are_there():
     assert len(re.findall(r"`test_\w+`", text)) >= 50
     gone = "| x | y | `core/test_rights.py`: `test_gone`; `core/test_none.py`: `test_x` |"
     assert lost_tests(gone) == ["core/test_rights.py::test_gone", "core/test_none.py::test_x"]
+
+
+def test_tests_that_the_page_on_faults_names_are_there():
+    """Each fault that was found names the test that shows its cure, in whatever file that lies."""
+    named = re.findall(r"`(test_\w+)`", (ROOT / "tests/sim/README.md").read_text("utf-8"))
+    files = [file.read_text("utf-8") for file in sorted((ROOT / "tests").rglob("*.py"))]
+    there = {name for text in files for name in re.findall(r"def (test_\w+)\(", text)}
+    assert len(named) >= 100
+    assert [name for name in named if name not in there] == []
 
 
 def test_a_module_that_has_gone_is_found():

@@ -25,7 +25,7 @@ Example::
     [actors.fusion]
     class = "actors.palletizing.fusion:Fusion"
     worlds = { training = "training", online = "online" }
-    options = { voxel_m = 0.002 }
+    args = { voxel_m = 0.002 }
 
 `enact_dist/docs/cell.md` explains every key; the dataclasses of `enact_dist.config.types` are what
 the file is read by, and this module adds what concerns several keys.

@@ -5,8 +5,9 @@
     ACQUIRING ──> VIEWING ──> HELD ──> VALIDATING ──> COMMITTING ──> COMMITTED
                                        (preparing)
         │            │          │           │              │
-        └────────────┴──────────┴───────────┴──────────────┴──> LOST · TIMED_OUT · UNREACHABLE ·
-                                                                REFUSED · UNKNOWN · RELEASED
+        └────────────┴──────────┴───────────┴──────────────┴──> LOST · CHANGED · TIMED_OUT ·
+                                                                UNREACHABLE · REFUSED · MISPLACED ·
+                                                                UNKNOWN · RELEASED
 
 Rules a change must keep
   * Shards are acquired in one global order (by name), waiting at one at a time: waits-for edges

@@ -237,7 +237,7 @@ class DecisionDone:
 class AuditRecord:
     """An operator's action or its outcome, stored permanently.
 
-    `kind` is one of `core.shard.forced_aborts`.
+    `kind` is one of `core.state.audit`.
     `identity` is who asked for it; "" for what the shard found by itself.
     """
 

@@ -164,7 +164,7 @@ def _first(claims: dict[LockId, Claim]) -> Claim:
 
 
 class LockTable:
-    """The table of one shard.  Pure bookkeeping: leases and tokens live in `shard`.
+    """The table of one shard.  Pure bookkeeping: leases and tokens live in `core.state.grants`.
 
     Attributes:
         claims: All claims, granted or waiting.

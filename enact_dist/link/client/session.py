@@ -493,6 +493,6 @@ class SessionClient:
             self.renew_once()
 
     def count(self, name: str, amount: int = 1) -> None:
-        """Add to one of the counters in `Cell.counters`."""
+        """Add to one of the counters that `Cell.statistics` returns."""
         with self._mutex:
             self.counters[name] = self.counters.get(name, 0) + amount
