@@ -12,7 +12,7 @@ from enact_dist.config.table import suggestion
 from enact_dist.core.protocol.datum_types import type_conflict
 from enact_dist.core.protocol.messages import AspectEntry, Item
 from enact_dist.core.protocol.placement import shard_of
-from enact_dist.core.state.retention import said
+from enact_dist.core.state.retention import stated_limits
 from enact_dist.errors import (
     DatumTypeError,
     MisuseError,
@@ -311,7 +311,10 @@ class Session:
             except DatumTypeError as error:
                 raise DatumTypeError(f"aspect {aspect.name!r}: {error}") from None
             entry = AspectEntry(
-                aspect.name, datum_type, durability, *said(checked_retention(aspect.retention))
+                aspect.name,
+                datum_type,
+                durability,
+                *stated_limits(checked_retention(aspect.retention)),
             )
             known = (aspect, entry, entry._replace(reads=True))
             self._entries[id(aspect)] = known

@@ -43,7 +43,7 @@ import inspect
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Literal
 
-from enact_dist.actor.granted import differences
+from enact_dist.actor.rights_check import differences
 from enact_dist.actor.running.doing import raised
 from enact_dist.actor.running.load import check_every_s, load_class, read_options
 from enact_dist.actor.uses import ActorDeclaration, Use, declared_rights, uses_of
@@ -51,7 +51,7 @@ from enact_dist.config.rights import text_of_declared
 from enact_dist.config.table import suggestion
 from enact_dist.core.protocol.datum_types import newest, type_conflict
 from enact_dist.core.protocol.messages import AspectEntry
-from enact_dist.core.state.retention import limits_of, said, with_larger
+from enact_dist.core.state.retention import limits_of, stated_limits, with_larger
 from enact_dist.errors import ConfigError, DatumTypeError, MisuseError
 from enact_dist.retention import checked_retention
 from enact_dist.terms import Entity
@@ -217,7 +217,9 @@ def _sets(
         together = actor.actor_class.declaration.together
         for request in together.requests if together is not None else ():
             aspect = request.aspect
-            entry = AspectEntry(aspect.name, "", "", *said(checked_retention(aspect.retention)))
+            entry = AspectEntry(
+                aspect.name, "", "", *stated_limits(checked_retention(aspect.retention))
+            )
             entry = with_larger(entry, configured.get(aspect.name, entry))
             if limits_of(entry).versions == 1:
                 yield ActorFinding(

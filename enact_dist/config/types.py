@@ -19,7 +19,7 @@ from enact_dist.config.rights import RightsConfig, SecurityConfig, compiled_righ
 from enact_dist.config.shows import GUESSED, Shows
 from enact_dist.config.table import TableKey
 from enact_dist.core.protocol.messages import AspectEntry, Pin, PlacementMap, ShardEntry
-from enact_dist.core.state.retention import said
+from enact_dist.core.state.retention import stated_limits
 from enact_dist.errors import ConfigError
 from enact_dist.retention import AGE_S_MAX, Retention, checked_retention
 from enact_dist.terms import Durability, Entities, Entity, checked_name
@@ -206,7 +206,7 @@ class AspectConfig:
     def entry(self) -> AspectEntry:
         """Return it as an entry of a catalogue, without a fingerprint: any type may register."""
         durability = self.durability.value if self.durability is not None else ""
-        return AspectEntry(self.name, "", durability, *said(self.retention))
+        return AspectEntry(self.name, "", durability, *stated_limits(self.retention))
 
 
 @dataclass(frozen=True, slots=True)

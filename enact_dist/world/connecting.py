@@ -62,7 +62,7 @@ def connect(
             has been connected (see `Cell`).
     """
     from enact_dist.link.client.joining import join
-    from enact_dist.link.zenoh.access import actor_said, session_of
+    from enact_dist.link.zenoh.access import actor_said, new_session_id
     from enact_dist.link.zenoh.config import OPEN_S
     from enact_dist.link.zenoh.tls import client_keys
 
@@ -78,7 +78,7 @@ def connect(
     if keys is not None:
         client.actor = actor_said(keys.name, client.actor)
     secret = secrets.token_hex(16)
-    client.session = session_of(keys.name if keys is not None else client.actor, secret)
+    client.session = new_session_id(keys.name if keys is not None else client.actor, secret)
     cell_name, cell_client, welcome = join(
         known.name,
         known.endpoints,

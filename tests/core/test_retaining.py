@@ -4,7 +4,14 @@ import pytest
 
 from enact_dist.core.protocol.messages import AspectEntry
 from enact_dist.core.protocol.parts import NO_LIMIT
-from enact_dist.core.state.retention import DEFAULT, Limits, covers, limits_of, said, with_larger
+from enact_dist.core.state.retention import (
+    DEFAULT,
+    Limits,
+    covers,
+    limits_of,
+    stated_limits,
+    with_larger,
+)
 from enact_dist.terms import Aspect, Retention
 
 
@@ -25,9 +32,9 @@ def test_unsaid_figure_has_no_limit_where_another_is_said():
 
 def test_retention_of_an_aspect_becomes_figures_of_its_entry():
     """A number of versions and its `Retention` say the same; a small age is not none."""
-    assert said(Retention(5, 1.5, 100)) == Limits(5, 1_500_000_000, 100)
-    assert said(Retention(age_s=0.001)) == Limits(0, 1_000_000, 0)
-    assert said(None) == Limits(0, 0, 0)
+    assert stated_limits(Retention(5, 1.5, 100)) == Limits(5, 1_500_000_000, 100)
+    assert stated_limits(Retention(age_s=0.001)) == Limits(0, 1_000_000, 0)
+    assert stated_limits(None) == Limits(0, 0, 0)
 
 
 @pytest.mark.parametrize(

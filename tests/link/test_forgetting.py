@@ -25,7 +25,7 @@ from enact_dist.core.protocol.messages import AspectEntry, Item, SlotVersion, Wr
 from enact_dist.core.protocol.placement import shard_of
 from enact_dist.core.protocol.records import AspectRecord, DecisionRecord, PreparedRecord
 from enact_dist.errors import DatumTypeError, ForgottenError, MisuseError, StoreError
-from enact_dist.link.folder.marks import mark, moving_mark
+from enact_dist.link.folder.moving_marks import mark, moving_mark
 from enact_dist.link.offline.forgetting import forget, look
 from enact_dist.link.store.store import open_store, read_store
 from enact_dist.terms import Access

@@ -20,7 +20,7 @@ from enact_dist import Aspect, Entities, Entity, Lock, View, ViewEach, Write, co
 from enact_dist.core.protocol import messages as m
 from enact_dist.errors import ConfigError, EnactError, PermissionDeniedError
 from enact_dist.link.host import ShardHost
-from enact_dist.link.zenoh.access import opens, session_of
+from enact_dist.link.zenoh.access import new_session_id, opens
 from enact_dist.link.zenoh.tls import KeyFiles, own_certificate, why_refused
 from enact_dist.verify.floods.raw import RawZenoh
 from enact_dist.wire.frames import encode_frame
@@ -76,7 +76,7 @@ def test_certificate_of_an_odd_name_lets_ask_who_is_there_and_no_more(tmp_path, 
     """One made with another tool: it stands for no name of the cell, under none is it heard."""
     cell = key_cells.KeyCell(tmp_path)
     files = certificate_of(cell, name)
-    hello = m.Hello(session_of("ada"), 0, 2_000_000_000, "ada", "vm", 1, False)
+    hello = m.Hello(new_session_id("ada"), 0, 2_000_000_000, "ada", "vm", 1, False)
     with cell.running(), RawZenoh(cell.config, keys=files) as raw:
         ping = encode_frame(m.Ping())[0]
         pongs = []
@@ -103,7 +103,7 @@ def test_certificate_of_a_server_opens_no_connection_of_a_client(tmp_path):
             RawZenoh(cell.config, keys=files) as raw,
             RawZenoh(cell.config, keys=cell.files("ben")) as ben,
         ):
-            ben.welcome("left", session_of("ben"), identity=BEN, actor="ben")
+            ben.welcome("left", new_session_id("ben"), identity=BEN, actor="ben")
             assert not raw.session.info.peers_zid()
 
 
@@ -130,7 +130,7 @@ def test_key_of_several_verbs_or_names_or_of_another_one_reaches_no_shard(
     """Zenoh drops it, or the shard refuses it before its core."""
     cell = key_cells.KeyCell(tmp_path)
     with cell.running(), RawZenoh(cell.config, keys=cell.files("ben")) as raw:
-        raw.welcome("left", session_of("ben"), identity=BEN, actor="ben")
+        raw.welcome("left", new_session_id("ben"), identity=BEN, actor="ben")
         submitted.clear()
         key = request_key("locked", "left", "ping", "client").rsplit("/", 2)[0]
         asked = raw.session.get(
@@ -257,7 +257,7 @@ def test_act_without_its_right_names_it_and_leaves_nothing(tmp_path, way):
 
 
 def test_secret_of_any_characters_is_compared():
-    session = session_of("ben")
+    session = new_session_id("ben")
 
     assert not opens("\N{SNOWMAN}" * 40, session)
     assert not opens("", session)

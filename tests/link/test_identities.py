@@ -19,8 +19,8 @@ from enact_dist.errors import EnactError, PermissionDeniedError
 from enact_dist.link.host import ShardHost
 from enact_dist.link.zenoh.access import (
     common_name,
+    new_session_id,
     read_revoked,
-    session_of,
     split_common_name,
 )
 from enact_dist.terms import Access
@@ -32,7 +32,7 @@ pytestmark = pytest.mark.carrier("zenoh")
 
 COUNT = Aspect("count", int)
 BEN = identity_of("ben", "host", 1)
-OTHER = session_of("ben")
+OTHER = new_session_id("ben")
 PIN = '[[pins]]\nentities = "bench"\nshard = "left"\n'
 RIGHTS = """
 [rights]
@@ -105,7 +105,7 @@ def test_messages_in_the_name_of_others_reach_no_session(cell, submitted):
         connect(cell.file, actor="ada") as victim,
         RawZenoh(cell.config, keys=cell.files("ben")) as raw,
     ):
-        welcome = raw.welcome("left", session_of("ben"), identity=BEN, actor="ben")
+        welcome = raw.welcome("left", new_session_id("ben"), identity=BEN, actor="ben")
         count = Write(victim.world("online"), Entity("bench"), COUNT)
         with Lock(count) as lock:
             lock[count] = 0
@@ -151,7 +151,7 @@ def test_stranger_hears_and_says_nothing_with_a_key_of_its_own(cell):
         connect(cell.file, actor="ada") as victim,
         RawZenoh(cell.config, mode="client", keys=cell.files("ben")) as raw,
     ):
-        raw.welcome("left", session_of("ben"), identity=BEN, actor="ben")
+        raw.welcome("left", new_session_id("ben"), identity=BEN, actor="ben")
         session = next(one.session for one in victim.actors() if one.actor == "ada")
         declared = [
             raw.session.declare_queryable(
@@ -187,7 +187,7 @@ def test_client_has_the_name_of_its_key(cell):
             probe_session = probe.actors()[0].session
             assert probe.why("online", "bench", "count").actor == "ada:probe"
         with RawZenoh(cell.config, keys=cell.files("ben")) as raw:
-            raw.welcome("left", session_of("ben"), identity=BEN, actor="ben")
+            raw.welcome("left", new_session_id("ben"), identity=BEN, actor="ben")
             for name in ("ada", "benn", "ada:ben", "client"):
                 answer = raw.ask("left", hello(OTHER, actor=name), actor=BEN)
                 assert answer.code == "permission"
@@ -251,7 +251,7 @@ def test_bar_ends_the_sessions_of_a_name_whatever_tokens_it_declares(cell, capsy
         connect(cell.file, actor="ada") as victim,
         RawZenoh(cell.config, keys=cell.files("ben")) as raw,
     ):
-        raw.welcome("left", session_of("ben"), identity=BEN, actor="ben")
+        raw.welcome("left", new_session_id("ben"), identity=BEN, actor="ben")
         count = Write(victim.world("online"), Entity("bench"), COUNT)
         with Lock(count) as lock:
             session = next(one.session for one in victim.actors() if one.actor == "ada")

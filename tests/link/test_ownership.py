@@ -21,7 +21,7 @@ from enact_dist.link.refusals import error_of
 from enact_dist.link.socket import service as socket_service
 from enact_dist.link.socket.carrier import SocketCarrier
 from enact_dist.link.socket.frames import FrameKind, Stream, greeting_of, send_frame
-from enact_dist.link.zenoh.access import session_of
+from enact_dist.link.zenoh.access import new_session_id
 from enact_dist.link.zenoh.config import MESSAGE_BYTES_MAX, close_session, open_session
 from enact_dist.link.zenoh.queries import wait_connected
 from enact_dist.wire.frames import decode_frame, encode_frame
@@ -237,7 +237,7 @@ def test_process_that_comes_before_the_owner_neither_ends_nor_bars_its_session(
 ):
     """With its id and its name, where the shard has not met it yet."""
     shard, secret = daemon(endpoint), secrets.token_hex(16)
-    session = session_of("tester", secret)
+    session = new_session_id("tester", secret)
 
     assert refused_eve(program, shard, session, "tester")
     behind = carry(endpoint, session=session)

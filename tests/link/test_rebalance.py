@@ -22,7 +22,7 @@ from enact_dist.core.protocol.records import (
 from enact_dist.core.shard.state import ShardSettings
 from enact_dist.errors import StoreError
 from enact_dist.link.folder.folder import refuse_strangers
-from enact_dist.link.folder.marks import moving_mark
+from enact_dist.link.folder.moving_marks import moving_mark
 from enact_dist.link.offline import rebalance as module
 from enact_dist.link.offline.rebalance import look, rebalance
 from enact_dist.link.opening import open_host

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 
-class Told(NamedTuple):
+class BenchHelp(NamedTuple):
     """What `--help` says of a bench.
 
     Attributes:
@@ -23,47 +23,53 @@ class Told(NamedTuple):
 
 
 BENCHES: Final = {
-    "floor": Told(
+    "floor": BenchHelp(
         "the machine and the bare transports: Zenoh, Unix socket, memory, disk", minutes=True
     ),
-    "core": Told("a shard's decisions alone: a lock and its commit, hand-over among 1,000"),
-    "update": Told("lock, read, write, release, by durability, over each carrier", minutes=True),
-    "layers": Told(
+    "core": BenchHelp("a shard's decisions alone: a lock and its commit, hand-over among 1,000"),
+    "update": BenchHelp(
+        "lock, read, write, release, by durability, over each carrier", minutes=True
+    ),
+    "layers": BenchHelp(
         "where the time of an update, a fetch and a wake-up goes, layer by layer", minutes=True
     ),
-    "multi": Told("up to 32 slots in a lock, 8 threads side by side, slots on several shards"),
-    "durable": Told("commits that survive a power cut: one, from several threads, of 10 MB"),
-    "waiters": Told(
+    "multi": BenchHelp("up to 32 slots in a lock, 8 threads side by side, slots on several shards"),
+    "durable": BenchHelp("commits that survive a power cut: one, from several threads, of 10 MB"),
+    "waiters": BenchHelp(
         "hand-over of a slot to 2 to 32 waiting threads; updates of 1 and 4 clients", alone=False
     ),
-    "fetch": Told("reading arrays of 1 kB to 100 MB, seen before, new, from afar", minutes=True),
-    "publish": Told("writing arrays of 1 kB to 100 MB, and committing what was filled in place"),
-    "wakeup": Told("from a commit in one process to its array in another", alone=False),
-    "history": Told(
+    "fetch": BenchHelp(
+        "reading arrays of 1 kB to 100 MB, seen before, new, from afar", minutes=True
+    ),
+    "publish": BenchHelp(
+        "writing arrays of 1 kB to 100 MB, and committing what was filled in place"
+    ),
+    "wakeup": BenchHelp("from a commit in one process to its array in another", alone=False),
+    "history": BenchHelp(
         "what kept versions cost an update; looks at the past, forks, 8 cameras whose history"
         " fills memory (not with --connect)",
         minutes=True,
     ),
-    "pipeline": Told(
+    "pipeline": BenchHelp(
         "17 processes: 8 cameras at 10 Hz, 8 workers, a reader of whole sets",
         alone=False,
         minutes=True,
     ),
-    "stopped": Told("updates beside a reader of 50 MB that stands still", alone=False),
-    "memory": Told("a daemon's memory per slot and per commit", alone=False, guest=False),
-    "recovery": Told(
+    "stopped": BenchHelp("updates beside a reader of 50 MB that stands still", alone=False),
+    "memory": BenchHelp("a daemon's memory per slot and per commit", alone=False, guest=False),
+    "recovery": BenchHelp(
         "how soon locks are back after a holder or a shard was killed",
         alone=False,
         guest=False,
         minutes=True,
     ),
-    "security": Told(
+    "security": BenchHelp(
         "what keys and rights cost a call, an update and large data; needs the extra 'keys'",
         alone=False,
         guest=False,
         named=True,
     ),
-    "view": Told(
+    "view": BenchHelp(
         "`enact view` of 8 cameras, a hull and two robots at 10 Hz: updates shown, what one costs,"
         " the cell with and without it; needs the extra 'view'",
         alone=False,
@@ -71,7 +77,7 @@ BENCHES: Final = {
         minutes=True,
         named=True,
     ),
-    "workcell": Told(
+    "workcell": BenchHelp(
         "eight cameras, hull, speed and path of `enact demo workcell`, scored on its truth;"
         " --embedded plays twelve scenarios in simulated time, which no load changes, for its"
         " quality alone",
@@ -79,7 +85,7 @@ BENCHES: Final = {
         minutes=True,
         named=True,
     ),
-    "palletizing": Told(
+    "palletizing": BenchHelp(
         "robot, gripper and depth sensors pack --packages in simulated physics and time, scored on"
         " what physics did: placements, verdicts by kind, recoveries, damage, cycle",
         guest=False,

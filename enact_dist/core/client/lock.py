@@ -6,8 +6,7 @@
                                        (preparing)
         │            │          │           │              │
         └────────────┴──────────┴───────────┴──────────────┴──> LOST · CHANGED · TIMED_OUT ·
-                                                                UNREACHABLE · REFUSED · MISPLACED ·
-                                                                UNKNOWN · RELEASED
+                                  UNREACHABLE · REFUSED · MISPLACED · UNKNOWN · RELEASED
 
 Rules a change must keep
   * Shards are acquired in one global order (by name), waiting at one at a time: waits-for edges

@@ -310,7 +310,7 @@ class Limits(NamedTuple):
     size: int
 
 
-def said(retention: Retention | None) -> Limits:
+def stated_limits(retention: Retention | None) -> Limits:
     """Return a retention as an entry bears it: 0 for what is unsaid."""
     if retention is None:
         return UNSAID
@@ -319,7 +319,7 @@ def said(retention: Retention | None) -> Limits:
 
 
 UNSAID: Final = Limits(0, 0, 0)
-DEFAULT: Final = said(DEFAULT_RETENTION)
+DEFAULT: Final = stated_limits(DEFAULT_RETENTION)
 
 
 def limits_of(entry: AspectEntry) -> Limits:

@@ -40,7 +40,7 @@ from enact_dist.link.folder.folder import (
 from enact_dist.link.folder.held_bodies import held_bodies, hold
 from enact_dist.link.folder.lock import FORMAT_FILE, FolderLock, replace_file, sync_folder
 from enact_dist.link.folder.mark import MARK_FILE
-from enact_dist.link.folder.marks import refuse_moving
+from enact_dist.link.folder.moving_marks import refuse_moving
 from enact_dist.link.folder.wal_check import HEADER_BYTES, check_wal
 from enact_dist.link.offline.backup_files import (
     BACKUP_FILE,

@@ -1,7 +1,7 @@
 """The folders of a stopped cell, opened together and changed in steps.
 
 Each step is durable before the next one, so a later run completes one that was killed anywhere.
-While a folder is marked (`link.folder.marks`), no shard starts from it.
+While a folder is marked (`link.folder.moving_marks`), no shard starts from it.
 """
 
 from __future__ import annotations

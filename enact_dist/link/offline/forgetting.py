@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 from enact_dist.config.table import suggestion
 from enact_dist.core.offline.forgetting import planned, unused_aspects, unused_worlds, world_drops
 from enact_dist.errors import MisuseError
-from enact_dist.link.folder.marks import mark, under_way, unmark
+from enact_dist.link.folder.moving_marks import mark, under_way, unmark
 from enact_dist.link.offline.cell import SILENT, opened, refuse_obstacles, write
 
 if TYPE_CHECKING:

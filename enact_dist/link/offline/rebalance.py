@@ -24,7 +24,7 @@ from typing import Final, NamedTuple, Protocol
 from enact_dist.core.offline.moving import Move, MovePlan, Shards
 from enact_dist.core.protocol.messages import PlacementMap
 from enact_dist.core.protocol.records import Recovered
-from enact_dist.link.folder.marks import mark, under_way, unmark
+from enact_dist.link.folder.moving_marks import mark, under_way, unmark
 from enact_dist.link.offline.cell import SILENT, opened, refuse_obstacles, write
 from enact_dist.link.store.store import Store
 

@@ -30,7 +30,7 @@ from enact_dist.link.folder.folder import (
 )
 from enact_dist.link.folder.lock import FolderLock, check_format
 from enact_dist.link.folder.mark import MarkFile
-from enact_dist.link.folder.marks import refuse_moving
+from enact_dist.link.folder.moving_marks import refuse_moving
 from enact_dist.link.offline.backup import check_bodies, renamed, sync_all
 from enact_dist.link.offline.backup_files import FILE_MODE, FOLDER_MODE, partial_folder
 from enact_dist.link.postgres.ahead import streamed

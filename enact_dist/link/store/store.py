@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.core.protocol.records import Persist, Recovered
 from enact_dist.errors import StoreError
 from enact_dist.link.folder.lock import FolderLock
-from enact_dist.link.folder.marks import refuse_moving
+from enact_dist.link.folder.moving_marks import refuse_moving
 from enact_dist.link.store.batch import Batch
 from enact_dist.link.store.database import DatabaseRow
 from enact_dist.link.store.medium import FolderMedium, folder_errors, read_folder

@@ -9,10 +9,10 @@ shard itself checks everything else (see `enact_dist.core.shard.owners`).
 In a cell with keys, the rules bind the name in the key of each request and token to the name that
 the sender's certificate proves.  Names that the cell does not know may only ping, without a name,
 so that a client can tell a shard that is down from one that does not let it in.  A session's id
-ends with a mark of its owner's name (`session_of`): otherwise a client could greet a shard with the
-id of another one, which listings show, before that one does.  The rest of the id is the hash of a
-secret that only shards of the client's own host hear, over their sockets: no other process can open
-a connection for the session, and so none can end it with its own end.
+(`new_session_id`) ends with a mark of its owner's name: otherwise a client could greet a shard with
+the id of another one, which listings show, before that one does.  The rest of the id is the hash of
+a secret that only shards of the client's own host hear, over their sockets: no other process can
+open a connection for the session, and so none can end it with its own end.
 
 Zenoh drops forbidden messages silently: a query gets no reply, a declaration reaches no peer.  A
 query passes only if its key is *included* in an allowed one, so a query with wildcards for several
@@ -142,7 +142,7 @@ def actor_said(name: str, actor: str) -> str:
     return name if actor in {name, ""} else f"{name}:{actor}"[:NAME_CHARACTERS_MAX]
 
 
-def session_of(name: str, secret: str = "") -> str:
+def new_session_id(name: str, secret: str = "") -> str:
     """Return a new id for a session of a name.
 
     Its first part is the hash of `secret` (default: one that is not kept), which opens a shard's
@@ -158,7 +158,7 @@ def _hash_of(secret: str) -> str:
 def opens(secret: str, session: str) -> bool:
     """Say whether a secret opens a socket for a session.
 
-    An id of another length than those of `session_of` is no hash, and needs no secret.
+    An id of another length than those of `new_session_id` is no hash, and needs no secret.
     """
     if len(session) != SESSION_CHARACTERS:
         return True
