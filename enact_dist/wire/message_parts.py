@@ -14,10 +14,10 @@ import typing
 from collections.abc import Callable, Sequence
 from dataclasses import fields as fields_of
 from dataclasses import is_dataclass
-from functools import partial
+from functools import cache, partial
 from itertools import product
 from operator import attrgetter
-from typing import Any, Final, get_args, get_origin, get_type_hints
+from typing import Any, Final, TypeVar, cast, get_args, get_origin, get_type_hints
 
 from enact_dist.core.protocol.datum import Datum
 from enact_dist.errors import ProtocolError
@@ -70,6 +70,12 @@ LENGTHS_MAX_OF: Final = {
 """The same where answers have longer fields of that name: to read 100,000 parts takes 0.6 s, for
 which a shard takes no other request over Zenoh."""
 SCALARS: Final = frozenset({int, str, bytes, bool})
+_Made = TypeVar("_Made")
+
+
+def _once(make: Callable[[type[Any]], _Made]) -> Callable[[type[Any]], _Made]:
+    """Call a function once for each class; all who ask share what it returns."""
+    return cast("Callable[[type[Any]], _Made]", cache(make))
 
 
 # ---------------------------------------------------------------- writers
@@ -144,6 +150,7 @@ def _writer_of_each(writers: list[tuple[int, Write]]) -> Write:
 # ---------------------------------------------------------------- readers
 
 
+@_once
 def reader_of(cls: type[Any]) -> Read:
     """Return what checks the array of a message, or of a part of one, and builds it."""
     fields = annotated(cls)
@@ -216,11 +223,12 @@ def reader_of_each(kind: Any) -> Read:
 # ---------------------------------------------------------------- annotations
 
 
-def annotated(cls: type[Any]) -> list[tuple[str, Any]]:
+@_once
+def annotated(cls: type[Any]) -> tuple[tuple[str, Any], ...]:
     """Return the fields of a message class and their types, in the order of the wire."""
     hints = get_type_hints(cls)
     names = [field.name for field in fields_of(cls)] if is_dataclass(cls) else list(cls._fields)
-    return [(name, hints[name]) for name in names]
+    return tuple((name, hints[name]) for name in names)
 
 
 def without_none(kind: Any) -> Any:
@@ -238,7 +246,8 @@ def _raw_types(kind: Any) -> tuple[type[Any], ...]:
     return (raw,) if inner is kind else (raw, type(None))
 
 
-def lengths_of(cls: type[Any]) -> list[tuple[int, int]]:
+@_once
+def lengths_of(cls: type[Any]) -> tuple[tuple[int, int], ...]:
     """Return the places and greatest lengths of fields that msgpack's own limits leave open."""
     lengths = []
     for index, (name, kind) in enumerate(annotated(cls)):
@@ -247,7 +256,7 @@ def lengths_of(cls: type[Any]) -> list[tuple[int, int]]:
         length_max = LENGTHS_MAX_OF.get((cls.__name__, name), LENGTHS_MAX.get(name))
         if length_max is not None and len(raw_types) == 1 and not is_part:
             lengths.append((index, length_max))
-    return lengths
+    return tuple(lengths)
 
 
 def too_long(cls: type[Any], index: int, length: int, length_max: int) -> ProtocolError:
