@@ -17,6 +17,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
+import weakref
 from abc import ABC, abstractmethod
 from collections import deque
 from dataclasses import dataclass
@@ -26,7 +27,7 @@ from enact_dist.access.arguments import check_seconds
 from enact_dist.core.protocol.datum import Position, Slot
 from enact_dist.core.protocol.messages import Notice, Ping, SlotState, Survey, Surveyed
 from enact_dist.core.state.clock import STAMP_NS_MAX, is_kept, is_older
-from enact_dist.errors import LinkError, ShardUnreachableError
+from enact_dist.errors import LinkError, MisuseError, ShardUnreachableError
 from enact_dist.link.notices import Interest, Skipped
 from enact_dist.terms import Durability, Entities, Entity
 
@@ -48,6 +49,7 @@ VANISHED: Final = (0, 0)
 
 
 T = TypeVar("T")
+_open: weakref.WeakSet[Watch] = weakref.WeakSet()
 
 
 class Closing(ABC):
@@ -178,6 +180,12 @@ class Watch(Following[Change]):
         except BaseException:
             self._feed.close()
             raise
+        _open.add(self)
+
+    @property
+    def closed(self) -> bool:
+        """Whether it has ended."""
+        return self._closed.is_set()
 
     @property
     def missed(self) -> int:
@@ -196,6 +204,14 @@ class Watch(Following[Change]):
         if timeout_s is not None:
             check_seconds("timeout_s", timeout_s)
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
+        try:
+            return self._next(deadline_s)
+        except MisuseError:
+            if self._closed.is_set():  # before its cell was
+                return None
+            raise
+
+    def _next(self, deadline_s: float | None) -> Change | None:
         while not self._closed.is_set():
             if self._pending:
                 return self._pending.popleft()
@@ -390,3 +406,9 @@ class Watch(Following[Change]):
         """End the watch; a `next` that waits returns None within 0.1 s."""
         self._closed.set()
         self._feed.close()
+
+
+def end_watches() -> None:
+    """End all watches before their cells: the process ends, which no thread has asked for."""
+    for watch in list(_open):
+        watch._closed.set()  # noqa: SLF001 - of this module; each cell closes its feeds

@@ -59,7 +59,6 @@ class DiffWatch(Following["Comparison"]):
         self._pending: deque[Comparison] = deque()
         self._past_world = next((world for world in self._worlds if past_ns_of(world)), None)
         self._past: SideView | None = None
-        self._closed = False
         names = tuple(dict.fromkeys(world.name for world in present))
         wanted = tuple(self._types) if aspects else ()
         # Before the first comparison, so that no change falls between the two.
@@ -89,16 +88,16 @@ class DiffWatch(Following["Comparison"]):
             MisuseError: The cell was closed.
         """
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
-        while not self._pending and not self._closed:
+        while not self._pending and not self._watch.closed:
             left_s = None if deadline_s is None else max(0.0, deadline_s - time.monotonic())
             self._take_changes(0.0 if self._changed else left_s)
             if self._changed:
                 repeated(self._compare_changed, self._release_past)
-            elif left_s is None or self._closed:
+            elif left_s is None or self._watch.closed:
                 continue
             if left_s == 0.0 and not self._pending:
                 return None
-        return self._pending.popleft() if self._pending and not self._closed else None
+        return self._pending.popleft() if self._pending and not self._watch.closed else None
 
     def _take_changes(self, wait_s: float | None) -> None:
         """Note which slots have changed since they were compared; wait for a first one."""
@@ -169,6 +168,5 @@ class DiffWatch(Following["Comparison"]):
 
     def close(self) -> None:
         """End the watch; a `next` that waits returns None within 0.1 s.  Twice is harmless."""
-        self._closed = True
         self._watch.close()
         self._release_past()

@@ -16,7 +16,7 @@ from enact_dist.access.arguments import check_reason
 from enact_dist.access.asking import ask_all, await_stamp
 from enact_dist.access.lock import refuse_inside_lock
 from enact_dist.access.session import Session
-from enact_dist.access.watch import Closing
+from enact_dist.access.watch import Closing, end_watches
 from enact_dist.core.protocol.datum import Position
 from enact_dist.core.protocol.messages import (
     Break,
@@ -490,6 +490,7 @@ class Cell(FormerNames, Closing):
 
 
 def _close_all() -> None:
+    end_watches()
     for client, host in list(_open.items()):
         with contextlib.suppress(EnactError):
             client.close()

@@ -409,6 +409,34 @@ def test_interpreter_ends_when_a_cell_was_never_closed():
     assert (done.stdout, done.stderr) == ("end\n", "")
 
 
+FOLLOWED = """
+import atexit, sys, threading
+from enact_dist import *
+begun, threads = threading.Event(), []
+atexit.register(lambda: threads[0].join(60))  # after the cell's end
+cell = local(worlds=["a", "b"])
+a, b = cell.world("a"), cell.world("b")
+a.init(Entity("e"), Aspect("n", int), 1)
+def follow():
+    for _ in eval(sys.argv[1]):
+        begun.set()
+    print("ended")
+threads.append(threading.Thread(target=follow, daemon=True))
+threads[0].start()
+begun.wait(60)
+"""
+
+
+@pytest.mark.parametrize("followed", ["a.watch('**')", "a.watch_diff(b)"])
+def test_a_watch_ends_quietly_with_the_interpreter(followed):
+    """Its cell is closed by the end of the process, which is no misuse of its thread."""
+    done = subprocess.run(
+        [sys.executable, "-c", FOLLOWED, followed],
+        capture_output=True, text=True, timeout=180, check=True,
+    )  # fmt: skip
+    assert (done.stdout, done.stderr) == ("ended\n", "")
+
+
 @pytest.mark.parametrize("fails", [False, True])
 @pytest.mark.parametrize("request_", [Read, View, Write, ReadEach, ViewEach, WriteEach])
 def test_data_of_a_lock_go_with_its_block(cell, online, request_, fails):
