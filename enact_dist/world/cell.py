@@ -469,7 +469,7 @@ class Cell(FormerNames, Closing):
         return aspect_infos(self._session, world)
 
     def statistics(self) -> dict[str, int]:
-        """Return this connection's own counters by name."""
+        """Return this connection's own counters; `link.daemon.counters` explains each."""
         return dict(self._client.counters)
 
     # ---------------------------------------------------------------- end

@@ -6,7 +6,9 @@ from pathlib import Path
 import enact_dist
 from enact_dist.core.protocol.messages import ListSessions, PlacementMap, ShardEntry
 from enact_dist.core.shard.state import ShardSettings
+from enact_dist.errors import LinkError
 from enact_dist.link.daemon.counters import OF_A_CONNECTION, OF_A_SHARD, described
+from enact_dist.link.memory.payload_client import SharedPayloads
 from enact_dist.link.memory.payload_handler import PayloadHandler
 from enact_dist.link.opening import open_host
 
@@ -106,3 +108,31 @@ def test_ls_shows_counters_with_what_they_mean(enact, cell_file):
     assert "what to do" in out.splitlines()[0]
     assert OF_A_SHARD["commits"].meaning in out
     assert {line.split()[1] for line in out.splitlines()[1:]} <= set(OF_A_SHARD)
+
+
+def test_ls_shows_the_counters_of_its_own_connection(enact, cell_file, monkeypatch):
+    """Here: of a process in a container that does not share the folder of either shard."""
+
+    def refused(*_):
+        raise LinkError("no such folder")
+
+    made = SharedPayloads.__init__
+    defaults = made.__kwdefaults__ | {"open_folder": refused}
+    monkeypatch.setattr(made, "__kwdefaults__", defaults)
+
+    out = enact("shard", "ls", "--counters", "--cell", cell_file).out
+
+    (row,) = (line for line in out.splitlines() if line.startswith("(this command)"))
+    assert row.split()[2:4] == ["payload_folders_elsewhere", "2"]
+    assert OF_A_CONNECTION["payload_folders_elsewhere"].meaning in row
+
+
+def test_every_counter_of_a_connection_stands_in_its_table():
+    """Whoever adds one adds its line there."""
+    rows = [
+        f"| `{name}` | {figure.meaning} | {figure.remedy or '-'} |"
+        for name, figure in OF_A_CONNECTION.items()
+    ]
+    page = Path(enact_dist.__file__).parent / "docs" / "operations.md"
+
+    assert "\n".join(rows) + "\n\n" in page.read_text("utf-8")

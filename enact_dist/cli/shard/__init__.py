@@ -69,7 +69,8 @@ VERBS: Final = (
         f"list the shards of the cell and their states; data: bytes of {BODIES}",
         "shard:list_shards",
         "enact shard ls --cell tcp/127.0.0.1:7447",
-        (flag("--counters", "list the counters of each shard, and what they mean"), *READER),
+        (flag("--counters", "list the counters of each shard, and of this command's connection to"
+              " them, and what they mean"), *READER),
         columns=("shard", "endpoint", "state", "epoch", "up", "slots", "data", "shared", "sessions",
                  "locks", "rtt"),
         empty="no shards",

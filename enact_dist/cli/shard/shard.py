@@ -13,7 +13,7 @@ from enact_dist.cli.verbs import DONE, FAILED, UNREACHABLE, Output
 from enact_dist.config.types import CellConfig, without_password
 from enact_dist.core.state.clock import state_of
 from enact_dist.errors import ConfigError, MisuseError, ShardUnreachableError
-from enact_dist.link.daemon.counters import described
+from enact_dist.link.daemon.counters import OF_A_CONNECTION, described
 from enact_dist.world.trees import shown_s
 
 if TYPE_CHECKING:
@@ -149,7 +149,7 @@ def list_shards(options: argparse.Namespace) -> Output:
     """List all shards, also those that cannot be reached; why, if it is known, on a line each."""
     try:
         with open_cell(options) as cell:
-            shards = cell.shards()
+            shards, own = cell.shards(), cell.statistics()
     except ShardUnreachableError:
         _print_holders(options)
         raise
@@ -162,7 +162,7 @@ def list_shards(options: argparse.Namespace) -> Output:
                 print(f"enact: shard {shard.name}: {shard.problem}", file=sys.stderr)
 
     def counters() -> None:
-        _print_counters(shards)
+        _print_counters(shards, own)
         problems()
 
     if options.counters:
@@ -184,12 +184,10 @@ def _print_holders(options: argparse.Namespace) -> None:
         print(f"enact: {line}", file=sys.stderr)
 
 
-def _print_counters(shards: Sequence[ShardInfo]) -> None:
-    print_table(
-        ("shard", "counter", "value", "meaning", "what to do"),
-        [(shard.name, *row) for shard in shards for row in described(shard.counters)],
-        empty="no counters",
-    )
+def _print_counters(shards: Sequence[ShardInfo], own: Mapping[str, int]) -> None:
+    rows = [(shard.name, *row) for shard in shards for row in described(shard.counters)]
+    rows += [("(this command)", *row) for row in described(own, OF_A_CONNECTION)]
+    print_table(("shard", "counter", "value", "meaning", "what to do"), rows, empty="no counters")
 
 
 def check_shards(options: argparse.Namespace) -> Output:

@@ -1,7 +1,8 @@
 """What the figures of a shard and of a connection mean, and what to do if one grows.
 
 A shard counts from its start (`enact shard ls --counters`, `--json`, `/metrics`), a connection from
-its own (`Cell.statistics`).  Help texts, metrics and their documentation are made of these tables.
+its own (`Cell.statistics`; `enact shard ls --counters` for its own one).  Help texts, metrics and
+their documentation are made of these tables.
 A figure without a remedy counts work done, or is harmless.
 """
 
@@ -346,10 +347,12 @@ LATENCIES_OF_A_SHARD: Final[dict[str, Figure]] = {
 }
 
 
-def described(counters: Mapping[str, int]) -> Iterator[tuple[str, int, str, str]]:
+def described(
+    counters: Mapping[str, int], figures: Mapping[str, Figure] = OF_A_SHARD
+) -> Iterator[tuple[str, int, str, str]]:
     """Yield name, value, meaning and remedy of each counter above 0, in the order of the table."""
-    order = {name: number for number, name in enumerate(OF_A_SHARD)}
+    order = {name: number for number, name in enumerate(figures)}
     for name in sorted(counters, key=lambda name: (order.get(name, len(order)), name)):
         if counters[name]:
-            known = OF_A_SHARD.get(name, Figure("unknown: from a newer release"))
+            known = figures.get(name, Figure("unknown: from a newer release"))
             yield name, counters[name], known.meaning, known.remedy
