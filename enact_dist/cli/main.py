@@ -58,6 +58,16 @@ class _Parser(argparse.ArgumentParser):
         self._negative_number_matcher = re.compile(r"-\.?\d")
         self._intermixes = False
 
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        """Refuse what is no choice, and name the one that may have been meant."""
+        try:
+            super()._check_value(action, value)
+        except argparse.ArgumentError as error:
+            from enact_dist.config.table import suggestion
+
+            error.message += suggestion(str(value), map(str, action.choices or ()))
+            raise
+
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Parse words as `argparse` does, but refuse the unknown here and not at the top.
 

@@ -152,6 +152,26 @@ def test_usage_is_refused_with_status_2(words, capsys):
     assert "usage: enact" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("wrold tree online", "'wrold' (choose from 'up', 'shard', "),
+        ("world treee online", "did you mean 'tree'?\n"),
+        ("cell keys mkae", "did you mean 'make'?\n"),
+        ("bench --carrier soket", "did you mean 'socket'?\n"),
+        ("wrold tree online", "; did you mean 'world'?\n"),
+        ("nonsense", "'workcell')\n"),
+    ],
+)
+def test_a_misspelt_word_is_told_with_the_one_that_may_be_meant(words, said, capsys):
+    """Of commands, their verbs, and options with a choice; behind all that there are."""
+    with pytest.raises(SystemExit) as ended:
+        main(words.split())
+
+    assert ended.value.code == 2
+    assert said in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("words", [w for w, _ in walk_verbs(build_parser())], ids=" ".join)
 def test_wrong_usage_is_told_with_the_usage_of_its_verb(words, capsys):
     """Not with that of `enact` alone, which tells nothing of the verb."""
