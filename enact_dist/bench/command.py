@@ -190,16 +190,28 @@ def _say(text: str) -> None:
 
 @contextlib.contextmanager
 def _ends_in_order() -> Iterator[None]:
-    """Let SIGTERM end the processes and remove the files, of which some lie in memory."""
+    """Let SIGTERM and Ctrl-C end the processes and remove the files, of which some lie in memory.
+
+    After the first Ctrl-C the process is about to end; a further one would only break that off.
+    """
 
     def leave(*_: object) -> None:
         raise SystemExit(FAILED)
 
-    before = signal.signal(signal.SIGTERM, leave)
+    def interrupt(*_: object) -> None:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        error = KeyboardInterrupt()
+        error.add_note("the bench was interrupted; no figures are printed")
+        raise error
+
+    acts = {signal.SIGTERM: leave, signal.SIGINT: interrupt}
+    before = {number: signal.signal(number, act) for number, act in acts.items()}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, act in acts.items():
+            if signal.getsignal(number) is act:
+                signal.signal(number, before[number])
 
 
 def _ran(name: str, measured: Run) -> bool:

@@ -282,6 +282,34 @@ def test_bench_that_is_told_to_leave_removes_its_files(tmp_path):
         running.wait()
 
 
+@pytest.mark.slow
+def test_interrupted_bench_says_so_in_one_line(tmp_path):
+    """Ctrl-C reaches all its processes, too; a second one, while they end, changes nothing."""
+    running = subprocess.Popen(
+        [sys.executable, "-m", "enact_dist.cli.main", "bench", "floor", "--seconds", "300"],
+        env={**os.environ, "TMPDIR": str(tmp_path)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        until(lambda: list(tmp_path.glob("enact-bench-*/*socket_echo.log")))
+        os.killpg(running.pid, signal.SIGINT)
+        until(lambda: not list(tmp_path.glob("enact-bench-*")))
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(running.pid, signal.SIGINT)
+
+        assert running.communicate(timeout=120) == (
+            "",
+            "enact: the bench was interrupted; no figures are printed\n",
+        )
+        assert running.returncode == 130
+    finally:
+        running.kill()
+        running.wait()
+
+
 def processes_of(folder, word):
     """Return the processes that have a word and, in another, a folder on their command lines."""
     found = []
