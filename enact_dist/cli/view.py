@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from enact_dist.world.lineage import Made
 
 PORT: Final = 8080
+PORTS_TRIED: Final = 1000
 ANSWER_S: Final = 2.0
 """How long a shard is waited for: a page goes on without one that has gone."""
 
@@ -64,8 +66,9 @@ VERBS: Final = (
                    "address to listen on; beyond the loopback a browser needs the token that is"
                    f" printed, or that {TOKEN_VARIABLE} has (default: 127.0.0.1)",
                    default="127.0.0.1"),
-            option("--port", "N", f"port, the next free one if it is taken (default: {PORT})",
-                   type=port, default=PORT),
+            option("--port", "N",
+                   f"port, 0 for any (default: {PORT}, or the next free one if that is taken)",
+                   type=port),
             many("--shows", "ASPECT=KIND",
                  "as in enact record (default: as the cell.toml says, else guessed)", type=pair),
             option("--rate", "HZ", "most updates of a page per second (default: 10)",
@@ -106,11 +109,14 @@ def run_view(options: argparse.Namespace) -> int:
             ViewServer(
                 viewer,
                 host=options.host,
-                port=options.port,
+                port=PORT if options.port is None else options.port,
+                tries=PORTS_TRIED if options.port is None else 1,
                 token=token,
                 resolution=options.resolution,
             )
         )
+        if options.port is None and server.port != PORT:
+            print(f"enact: port {PORT} is taken; this is the next free one", file=sys.stderr)
         print(f"{viewer.name}: {server.url}", flush=True)
         stop.event.wait()
     return DONE

@@ -1,9 +1,14 @@
 """A page and its server, without a browser: its thread, its bounds, its moments."""
 
 import asyncio
+import contextlib
+import re
 import socket
+import subprocess
+import sys
 import threading
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -24,6 +29,8 @@ from enact_dist.view.pages.panels import NONE
 from enact_dist.view.pages.server import free_port
 from enact_dist.view.pages.texts import row_of
 from enact_dist.view.pages.viewer import Viewer, ViewSettings
+
+STORED = Path(__file__).parents[1] / "e2e" / "stored_before" / "recording.mcap"
 
 
 @pytest.fixture
@@ -173,21 +180,41 @@ def test_a_jump_leaves_no_trail(page):
     assert trails_at(5.0, 4) == []
 
 
-def test_a_taken_port_is_followed_by_the_next(page):
+def test_an_address_that_cannot_be_listened_on_is_refused():
+    """Of another machine, or with its ports taken; viser would wait for ever."""
+    with pytest.raises(ConfigError, match=r"192\.0\.2\.1 port 8080: .*assign[^;]*; choose with"):
+        free_port("192.0.2.1", 8080, 1000)
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        assert free_port("127.0.0.1", port) > port
-
-
-def test_an_address_that_cannot_be_listened_on_is_refused(monkeypatch):
-    """Of another machine, or with its last port taken; viser would wait for ever."""
-    with pytest.raises(ConfigError, match=r"192\.0\.2\.1 port 8080: .*assign"):
-        free_port("192.0.2.1", 8080)
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        monkeypatch.setattr("enact_dist.view.pages.server.PORT_MAX", port)
-        with pytest.raises(ConfigError, match=rf"127\.0\.0\.1 port {port}: .*in use"):
+        with pytest.raises(ConfigError, match=rf"127\.0\.0\.1 port {port}: .*in use; ss -ltnp"):
             free_port("127.0.0.1", port)
+
+
+def test_a_port_that_is_asked_for_and_taken_is_an_error(capsys):
+    """Whoever asked for it would look for the page there."""
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert main(["view", str(STORED), "--port", str(port)]) == 2
+    err = capsys.readouterr().err
+    assert f"'sport = :{port}' names the process that listens there; end it, or choose" in err
+
+
+def test_a_default_port_that_is_taken_is_told_with_the_next_one():
+    """Whoever holds it, this test or another program."""
+    words = [sys.executable, "-m", "enact_dist.cli.main", "view", str(STORED)]
+    with socket.socket() as taken:
+        taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        with contextlib.suppress(OSError):
+            taken.bind(("127.0.0.1", 8080))
+            taken.listen()
+        view = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        try:
+            address = view.stdout.readline()
+        finally:
+            view.terminate()
+            _, err = view.communicate(timeout=60)
+    assert re.search(r"http://127\.0\.0\.1:80(8[1-9]|9\d)", address)
+    assert err == "enact: port 8080 is taken; this is the next free one\n"
 
 
 @pytest.mark.parametrize("option", ["--rate", "--bytes"])

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from enact_dist.view.pages.viewer import Viewer
 
 
-PORTS_TRIED: Final = 1000
-PORT_MAX: Final = 65535
 TOKEN_BYTES: Final = 16
 
 
@@ -52,8 +50,8 @@ def load_viser() -> None:
     threading.Thread(target=import_module, args=("enact_dist.view.pages.door",)).start()
 
 
-def free_port(host: str, port: int) -> int:
-    """Return the port, or the next one that nothing listens on; 0 stays 0: any.
+def free_port(host: str, port: int, tries: int = 1) -> int:
+    """Return the port, or the first one of so many from it on that nothing listens on; 0 stays 0.
 
     viser itself would try for ever, in a thread that its constructor waits for.
 
@@ -61,7 +59,7 @@ def free_port(host: str, port: int) -> int:
         ConfigError: There is none, or the host is no address of this machine.
     """
     taken: OSError | None = None
-    for tried in range(port, min(port + PORTS_TRIED, PORT_MAX + 1)):
+    for tried in range(port, port + tries):
         try:
             _bind(host, tried)
         except OSError as error:
@@ -70,9 +68,10 @@ def free_port(host: str, port: int) -> int:
                 break
         else:
             return tried
-    raise ConfigError(
-        f"pages cannot be served at {host} port {port}: {taken}; choose with --host and --port"
-    ) from taken
+    found = f"pages cannot be served at {host} port {port}: {taken}; "
+    if taken is not None and taken.errno == errno.EADDRINUSE:
+        found += f"ss -ltnp 'sport = :{port}' names the process that listens there; end it, or "
+    raise ConfigError(f"{found}choose with --host and --port") from taken
 
 
 def _bind(host: str, port: int) -> None:
@@ -107,7 +106,8 @@ class ViewServer(Closing):
     Args:
         viewer: What they show.
         host: Address to listen on.
-        port: Port; the next free one if it is taken.
+        port: Port; 0 for any.
+        tries: How many ports from this one on are tried until one is free.
         token: What a browser has to know; None: nothing on the loopback, else a random one.
         resolution: So many pixels are drawn for each of a page, in both directions; None: as many
             as viser decides.
@@ -125,12 +125,13 @@ class ViewServer(Closing):
         viewer: Viewer,
         *,
         host: str = "127.0.0.1",
-        port: int = 8080,
+        port: int = 0,
+        tries: int = 1,
         token: str | None = None,
         resolution: float | None = None,
     ) -> None:
         require_viser()
-        port = free_port(host, port)
+        port = free_port(host, port, tries)
         from enact_dist.view.pages.door import Door, GuardedServer, is_loopback
 
         if token is None:
