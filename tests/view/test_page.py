@@ -284,3 +284,26 @@ def test_a_row_names_its_writer_while_the_datum_changes():
     assert "v2" in row_of(viewer, samples, slot_, None, "", 0)
     assert "by writer" in row_of(viewer, samples, slot_, None, "", 0)
     assert "by writer" not in row_of(viewer, samples, slot_, None, "", 5)
+
+
+def test_a_row_of_the_past_has_no_rate_size_or_holder_of_the_present():
+    """They would be read as those of then."""
+    slot_, samples = slot("arm", "speed"), SimpleNamespace(of=lambda *_: ())
+    catalogue = SlotCatalogue()
+    for version in (1, 2, 3):
+        now_s = time.monotonic() - 1.0 + version / 10.0
+        state = ListedState(version, round(now_s * 1e9), null=False)
+        catalogue.note(slot_, state, gap=0, now_s=now_s)
+    activity = CellActivity(held={str(slot_): "held by writer for 2 s"})
+    viewer = SimpleNamespace(
+        feed=SimpleNamespace(catalogue=catalogue),
+        entry=lambda _: None,
+        size=lambda _: 10_000,
+        type_of=lambda _: "float",
+        activity_now=lambda: activity,
+    )
+    now = row_of(viewer, samples, slot_, None, "", 0)
+    assert all(one in now for one in ("float", "10 Hz", "held by writer", "10.0 kB"))
+    then = row_of(viewer, samples, slot_, None, "", 5)
+    assert "float" in then
+    assert not any(one in then for one in ("Hz", "held by", "kB"))

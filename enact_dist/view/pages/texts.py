@@ -41,8 +41,11 @@ def row_of(
     recorded = shown.recorded if shown is not None else None
     state: ListedState | Recorded | None = recorded if past_ns else catalogue.state(slot)
     size, by = viewer.size(slot), _writer_of(viewer.entry(slot), recorded, past_ns)
-    if past_ns and recorded is not None:
-        size = recorded.datum.size if recorded.datum is not None else None
+    rate_hz = catalogue.rate_hz(slot, now_s)
+    held = viewer.activity_now().held.get(str(slot), "")
+    if past_ns:  # rates and holders of that moment are not known
+        datum = recorded.datum if recorded is not None else None
+        size, rate_hz, held = datum.size if datum is not None else None, None, ""
     name = markup.text(markup.slot_name(slot).removeprefix(below))
     value = markup.short_value(shown.value) if shown is not None else ""
     if recorded is not None and recorded.null_reason:
@@ -52,13 +55,11 @@ def row_of(
     facts = [viewer.type_of(slot.aspect)]
     if size is not None:
         facts.append(markup.size(size))
-    rate_hz = catalogue.rate_hz(slot, now_s)
     facts.append(f"{rate_hz:.3g} Hz" if rate_hz is not None else "")
     if state is not None:
         facts += [f"v{state.version}", markup.age(past_ns or time.time_ns(), state.stamp_ns)]
     if by is not None:
         facts.append(f"by {by or '(unnamed)'}")
-    held = viewer.activity_now().held.get(str(slot), "")
     facts += [f"lock: {held}"] if held else []
     under = markup.text(" · ".join(filter(None, facts)))
     return f'<div style="margin-bottom:3px">{line}<div style="color:#888">{under}</div></div>'
