@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import BinaryIO, Final, NamedTuple, cast
 
 import zstandard
@@ -44,11 +44,12 @@ class DamagedChunkError(Exception):
 
 
 class RawMessage(NamedTuple):
-    """One message: its channel, log time and bytes."""
+    """One message: its channel, log time and bytes, and where these begin in the unpacked chunk."""
 
     channel_id: int
     log_time: int
     data: bytes
+    begin: int
 
 
 class Chunk:
@@ -59,13 +60,19 @@ class Chunk:
         length: Bytes of that content.
         where: What messages call the chunk.
 
+    Attributes:
+        at: Where that content begins in the file.
+        size: Its bytes once it is unpacked.
+        packed: Its bytes in the file.
+        in_memory: Whether it is unpacked once and stays in memory; the file is not needed then.
+
     Raises:
         DamagedChunkError: It is no chunk.
         ProtocolError: It claims to unpack to more than this version reads.
     """
 
     def __init__(self, stream: BinaryIO, length: int, where: str) -> None:
-        self._stream = stream
+        self._stream, self.at = stream, stream.tell()
         fixed = stream.read(_HEAD.size)
         if len(fixed) < _HEAD.size:
             raise DamagedChunkError("a chunk ends in its head")
@@ -77,12 +84,13 @@ class Chunk:
         if len(rest) < _LENGTH.size:
             raise DamagedChunkError("a chunk ends in its head")
         (self.packed,) = _LENGTH.unpack(rest)
-        self._at = stream.tell()
+        self._packed_at = stream.tell()
         if self.packed != length - _HEAD.size - characters - _LENGTH.size:
             raise DamagedChunkError("a chunk is not as long as its record")
         if self._compression not in (b"", b"zstd", b"lz4"):
             raise DamagedChunkError("a chunk has a compression of no known name")
         self._refuse_claim(where)
+        self.in_memory = self.size <= IN_MEMORY_BYTES
         self._whole: bytes | None = None
 
     def _refuse_claim(self, where: str) -> None:
@@ -103,7 +111,7 @@ class Chunk:
             DamagedChunkError: It is not whole; what was yielded counts all the same.
         """
         checked = self._checked()
-        if self.size <= IN_MEMORY_BYTES:
+        if self.in_memory:
             self._whole = b"".join(checked)
             checked = iter((self._whole,))
         for opcode, length, parts in _records(_Pieces(checked)):
@@ -116,8 +124,9 @@ class Chunk:
 
     def messages(self, wanted: set[int]) -> Iterator[RawMessage]:
         """Yield the messages of these channels, each as it is unpacked; after `channels`."""
-        pieces = iter((self._whole,)) if self._whole is not None else self._unpacked()
-        for opcode, length, parts in _records(_Pieces(pieces)):
+        begin = 0
+        for opcode, length, parts in _records(self._pieces()):
+            begin += _RECORD_HEAD.size + length
             if opcode != Opcode.MESSAGE:
                 parts.skip(length)
                 continue
@@ -125,10 +134,28 @@ class Chunk:
             if len(head) < _MESSAGE_HEAD.size:
                 raise DamagedChunkError("a message ends in its head")
             channel_id, _, log_time, _ = _MESSAGE_HEAD.unpack(head)
+            rest = length - len(head)
             if channel_id in wanted:
-                yield RawMessage(channel_id, log_time, parts.take(length - len(head)))
+                yield RawMessage(channel_id, log_time, parts.take(rest), begin - rest)
             else:
-                parts.skip(length - len(head))
+                parts.skip(rest)
+
+    def parts(self, places: Iterable[tuple[int, int]]) -> Iterator[bytes]:
+        """Yield parts of the unpacked chunk, each by its begin and its length; they ascend.
+
+        Raises:
+            DamagedChunkError: It is not whole, or not as long.
+        """
+        if self._whole is None and self.in_memory:
+            self._whole = b"".join(self._checked())
+        pieces, at = self._pieces(), 0
+        for begin, length in places:
+            pieces.skip(begin - at)
+            yield pieces.take(length)
+            at = begin + length
+
+    def _pieces(self) -> _Pieces:
+        return _Pieces(iter((self._whole,)) if self._whole is not None else self._unpacked())
 
     def _checked(self) -> Iterator[bytes]:
         """Yield the unpacked pieces; at the end they are as many and what the chunk says."""
@@ -144,7 +171,7 @@ class Chunk:
     def _unpacked(self) -> Iterator[bytes]:
         left = self.packed
         lz4 = LZ4FrameDecompressor()
-        self._stream.seek(self._at)
+        self._stream.seek(self._packed_at)
         if self._compression == b"zstd":
             packed = cast("BinaryIO", _Part(self._stream, left))
             with zstandard.ZstdDecompressor().stream_reader(packed, closefd=False) as reader:

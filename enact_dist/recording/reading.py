@@ -11,8 +11,10 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from io import BytesIO
+from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
 
@@ -56,6 +58,20 @@ class AspectFacts(NamedTuple):
     durability: str
 
 
+class MessagePlace(NamedTuple):
+    """Where a version lies in a recording.
+
+    Attributes:
+        chunk: Where the content of its chunk's record begins in the file.
+        begin: Where its message begins in the unpacked chunk.
+        length: Bytes of its message.
+    """
+
+    chunk: int
+    begin: int
+    length: int
+
+
 class RecordedCommit(NamedTuple):
     """The data of one commit.
 
@@ -63,15 +79,17 @@ class RecordedCommit(NamedTuple):
         number: Its number in the recording; 0: what was there when the recording began.
         log_ns: Its log time in the file.
         versions: Its versions, in the order of the file.
+        places: Where each of them lies; empty of a commit that is not as it is in the file.
     """
 
     number: int
     log_ns: int
     versions: tuple[Recorded, ...]
+    places: tuple[MessagePlace, ...] = ()
 
 
 class Recording:
-    """A recording that is read.
+    """A recording that is read.  Used by one thread at a time.
 
     Args:
         path: The file.
@@ -98,6 +116,7 @@ class Recording:
         self._channels: dict[int, Channel] = {}
         self._exact: set[int] = set()
         self._channels_bytes = 0
+        self._kept: Chunk | None = None
         for _ in self._chunks(until_begin=True):
             pass
         if not self.facts:
@@ -117,17 +136,53 @@ class Recording:
         self.chunks = self.missing_bytes = 0
         for chunk in self._chunks():
             versions: list[Recorded] = []
+            places: list[MessagePlace] = []
             log_ns = 0
             for message in chunk.messages(self._exact):
                 recorded = self._checked(decode_recorded(message.data))
                 begins = versions and recorded.commit != versions[-1].commit
                 if begins:
-                    yield RecordedCommit(versions[0].commit, log_ns, tuple(versions))
-                    versions = []
+                    yield RecordedCommit(versions[0].commit, log_ns, tuple(versions), tuple(places))
+                    versions, places = [], []
                 versions.append(recorded)
+                places.append(MessagePlace(chunk.at, message.begin, len(message.data)))
                 log_ns = message.log_time
             if versions:
-                yield RecordedCommit(versions[0].commit, log_ns, tuple(versions))
+                yield RecordedCommit(versions[0].commit, log_ns, tuple(versions), tuple(places))
+
+    def versions_at(self, places: Iterable[MessagePlace]) -> Iterator[Recorded]:
+        """Yield the versions at some places that `commits` told, in the order of the file.
+
+        The chunk that was read last stays in memory, unless it is large.
+
+        Raises:
+            ConfigError: The file cannot be read any more.
+            ProtocolError: It has been changed.
+        """
+        try:
+            with self.path.open("rb") as stream:
+                for at, group in groupby(sorted(places), key=attrgetter("chunk")):
+                    chunk = self._chunk_at(stream, at)
+                    for data in chunk.parts((place.begin, place.length) for place in group):
+                        yield self._checked(decode_recorded(data))
+        except OSError as error:
+            raise ConfigError(f"cannot read {self.path}: {error.strerror}") from error
+        except _DAMAGES as error:
+            raise ProtocolError(f"{self.path} is not what it was before: {error}") from error
+
+    def _chunk_at(self, stream: BinaryIO, at: int) -> Chunk:
+        if self._kept is not None and self._kept.at == at:
+            return self._kept
+        self._kept = None  # two of them are never in memory at once
+        stream.seek(at - _RECORD_HEAD.size)
+        _, length = _RECORD_HEAD.unpack(stream.read(_RECORD_HEAD.size))
+        chunk = self._chunk(stream, length)
+        if chunk.in_memory:
+            self._kept = chunk
+        return chunk
+
+    def _chunk(self, stream: BinaryIO, length: int) -> Chunk:
+        return Chunk(stream, length, f"the chunk at byte {stream.tell()} of {self.path}")
 
     def _checked(self, recorded: Recorded) -> Recorded:
         """Return a version whose names no shard, log or terminal has to fear.
@@ -217,7 +272,7 @@ class Recording:
             elif record.name == END_RECORD:
                 self.end = record.metadata
         elif opcode == Opcode.CHUNK:
-            chunk = Chunk(stream, length, f"the chunk at byte {stream.tell()} of {self.path}")
+            chunk = self._chunk(stream, length)
             for content in chunk.channels():
                 channel = Channel.read(ReadDataStream(BytesIO(content)))
                 if channel.id not in self._channels:

@@ -129,8 +129,11 @@ class SlotCatalogue:
         with self._guard:
             return list(self._first.values())
 
-    def slots(self, world: str) -> list[Slot]:
-        """Return the data of a world context that are not null, by name; not to be changed."""
+    def slots(self, world: str, at_ns: int = 0) -> list[Slot]:
+        """Return the data of a world context that are not null, by name; not to be changed.
+
+        Only a recording knows which these were at an earlier moment, `at_ns`.
+        """
         with self._guard:
             known = self._by_world.get(world)
             if known is None:
@@ -144,7 +147,7 @@ class SlotCatalogue:
         with self._guard:
             return sorted({slot.context for slot in self._states}.union(self._worlds))
 
-    def listing(self, world: str, path: str = "", wanted: str = "") -> Listing:
+    def listing(self, world: str, path: str = "", wanted: str = "", at_ns: int = 0) -> Listing:
         """Return what the tree shows.
 
         Args:
@@ -152,8 +155,9 @@ class SlotCatalogue:
             path: Entities below this one (``camera/``); "": all.
             wanted: Text that ``entity/aspect`` contains, or a pattern of entities with ``*``; it
                 goes through the whole context.
+            at_ns: As of which moment, see `slots`; 0: the present.
         """
-        slots = self.slots(world)
+        slots = self.slots(world, at_ns)
         if wanted:
             low = wanted.lower()
             found = [

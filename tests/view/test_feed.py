@@ -13,7 +13,6 @@ from enact_dist.config.shows import GUESSED, Shows
 from enact_dist.core.protocol.datum import Slot
 from enact_dist.errors import ConfigError, MisuseError, UnknownWorldError
 from enact_dist.recording import Recorder
-from enact_dist.recording.reading import Recording
 from enact_dist.view import feed as feeds
 from enact_dist.view.activity import Activity
 from enact_dist.view.feed import Feed
@@ -404,7 +403,7 @@ def test_a_moment_too_large_for_a_browser_is_refused_and_leaves_no_file(cell, mo
 
 
 def test_a_recording_is_a_past(cell, tmp_path):
-    """Forwards and backwards, with nothing but one state in memory."""
+    """Forwards and backwards."""
     recorder, stop = Recorder(cell, tmp_path / "run.mcap"), threading.Event()
     done = threading.Thread(target=recorder.run, args=(stop,))
     done.start()
@@ -423,18 +422,3 @@ def test_a_recording_is_a_past(cell, tmp_path):
         found = contents.data([SLOT])[SLOT]
         assert found.value[0, 3] == x_m
         assert "by writer, process" in datum_of(contents, Samples(), SLOT, found)
-
-
-def test_no_page_reads_a_recording_again_for_another(cell, tmp_path, monkeypatch):
-    """Each goes through the file by itself, so that only its own steps back read it again."""
-    stamp_ns = move(cell, 1.0).stamp_ns
-    name, content = recording_of(CellSource(cell), "online", stamp_ns, SHOWS)
-    (tmp_path / name).write_bytes(content)
-    source = RecordingSource(tmp_path / name)
-    one, other = source.of_page(), source.of_page()
-    begun, commits = [], Recording.commits
-    monkeypatch.setattr(Recording, "commits", lambda file: begun.append(1) or commits(file))
-    for _ in range(3):
-        assert one.data_at([SLOT], source.timeline.newest_ns).data.keys() == {SLOT}
-        assert not other.data_at([SLOT], source.timeline.newest_ns - 1).data
-    assert len(begun) == 2

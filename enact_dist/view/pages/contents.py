@@ -99,9 +99,14 @@ class PageContents:
         """The moment that is shown."""
         return self._feed.moment_ns if self.player.live else self.player.at_ns
 
+    @property
+    def past_ns(self) -> int:
+        """The moment of the past that is shown; 0: the present."""
+        return 0 if self.player.live else self.player.at_ns
+
     def drawable(self) -> list[Slot]:
         """Return the data of the world context that a scene can show, hidden ones too."""
-        return self._feed.in_scene(self._feed.catalogue.slots(self.world))
+        return self._feed.in_scene(self._feed.catalogue.slots(self.world, self.past_ns))
 
     def drawn(self, drawable: Iterable[Slot]) -> list[Slot]:
         """Return the data to draw of those that a scene can show, and the models of arms."""
@@ -119,7 +124,7 @@ class PageContents:
         """Return the data that are labels."""
         if not self.label:
             return []
-        slots = self._feed.catalogue.slots(self.world)
+        slots = self._feed.catalogue.slots(self.world, self.past_ns)
         return [slot for slot in slots if slot.aspect == self.label][:SCENE_MAX]
 
     def look_back(self, slots: Sequence[Slot], at_ns: int = 0) -> None:

@@ -170,6 +170,8 @@ class Page:
         if listing_due:
             self._listed_s = now_s
             self._list()
+        elif player.playing:
+            self._drawable = contents.drawable()
         drawn = contents.drawn(self._drawable)
         labelled, rows = contents.labelled(), self._followed()
         wanted = list(dict.fromkeys([*drawn, *labelled, *rows]))
@@ -234,7 +236,9 @@ class Page:
         worlds = catalogue.worlds()
         if not contents.world and worlds:
             contents.world = worlds[0]
-        self._listing = catalogue.listing(contents.world, self._path, self._filter)
+        self._listing = catalogue.listing(
+            contents.world, self._path, self._filter, contents.past_ns
+        )
         self._drawable = contents.drawable()
         self._samples.only(set(self._rows()))
         self._viewer.list_for(self, self._rows())
@@ -255,7 +259,7 @@ class Page:
     def _show_panels(self, data: Mapping[Slot, ShownDatum]) -> None:
         contents, player, listing = self.contents, self.contents.player, self._listing
         assert listing is not None
-        below, past_ns = "" if self._filter else self._path, 0 if player.live else player.at_ns
+        below, past_ns = "" if self._filter else self._path, contents.past_ns
         rows = [
             texts.row_of(self._viewer, self._samples, slot, data.get(slot), below, past_ns)
             for slot in listing.slots

@@ -124,11 +124,11 @@ class Viewer(Closing):
         return self._activity.entry(slot) if self._activity is not None else None
 
     def size(self, slot: Slot) -> int | None:
-        """Return the bytes of a listed slot's newest version, None if they are not known."""
+        """Return the bytes of a listed slot's newest datum, None if they are not known."""
         if isinstance(self.source, CellSource):
             entry = self.entry(slot)
             return entry.state.size if entry is not None else None
-        return self.source.sizes.get(slot)
+        return self.source.size(slot)
 
     def type_of(self, aspect: str) -> str:
         """Return the type of an aspect in a few words; "" if it is not known."""
