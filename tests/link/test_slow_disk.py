@@ -1,19 +1,42 @@
 """A shard whose disk stands still is alive: it says so, and nobody takes it for dead."""
 
 import threading
+import time
 
 import pytest
-from quiet_moments import ATTEMPTS, met_once
 
 from enact_dist import Aspect, Entity, Lock, Write, connect
+from enact_dist.core.protocol.messages import OUTCOME_PENDING, Commit, Outcome, OutcomeIs
 from enact_dist.errors import CommitUnknownError, ShardUnreachableError
 from enact_dist.link import host_figures as stalls
 from enact_dist.link.client import locks as client
 from enact_dist.link.client import session as session_client
 from enact_dist.link.store.store import Store
+from enact_dist.link.zenoh import discovery
+from enact_dist.world import connecting
 
 COUNT = Aspect("count", int)
 CUP = Entity("cup")
+HOUR_S = 3600.0
+
+
+class PassingTime:
+    """This host's clocks, on which a test lets time pass at once."""
+
+    passed_s = 0.0
+    sleep = staticmethod(time.sleep)
+
+    def monotonic(self):
+        return time.monotonic() + self.passed_s
+
+    def boottime_ns(self):
+        return session_client.boottime_ns() + int(self.passed_s * 1e9)
+
+
+@pytest.fixture(autouse=True)
+def _long_leases(monkeypatch):
+    """A session outlives what stands still beside the disk: what is tested is not its lease."""
+    monkeypatch.setattr(connecting, "TTL_S", 60.0)
 
 
 @pytest.fixture
@@ -48,52 +71,70 @@ def disk_lines(caplog):
 
 
 def test_commit_that_the_disk_still_works_on_says_so(daemon, endpoint, tmp_path, disk, monkeypatch):
-    """The shard answers all the time, only not with the end; its word for it is passed on."""
+    """A shard that has not kept a commit yet says so; once time is up its word is passed on."""
     daemon(endpoint, folder=tmp_path, durability="durable")
-    monkeypatch.setattr(client, "FINISH_S", 2.5)
+    monkeypatch.setattr(client, "FINISH_S", HOUR_S)
     with connect(endpoint) as cell:
         add_one(cell)
+        clock, asked, request = PassingTime(), [], cell._client.carrier.request
+        monkeypatch.setattr(cell._client, "_now_ns", clock.boottime_ns)
 
-        def attempt():
-            disk.clear()
-            try:
-                with pytest.raises(CommitUnknownError, match="s0 still works on it") as caught:
-                    add_one(cell)
-                assert "no answer" not in str(caught.value)
-            finally:
-                disk.set()
-            assert cell.outcome(caught.value.lock_id) is not None
+        def ask(shard, message, **options):
+            answer = request(shard, message, **options)
+            if isinstance(message, Commit | Outcome):
+                asked.append((type(message), getattr(answer, "kind", answer)))
+            if isinstance(answer, OutcomeIs):  # the time for the commit ends with this word
+                clock.passed_s = HOUR_S
+            return answer
 
-        met_once(attempt)
+        monkeypatch.setattr(cell._client.carrier, "request", ask)
+        disk.clear()
+        with pytest.raises(CommitUnknownError, match="s0 still works on it") as caught:
+            add_one(cell)
+        assert asked[0] == (Commit, None)
+        assert asked[-1] == (Outcome, OUTCOME_PENDING)
+        assert "no answer" not in str(caught.value)
+
+        disk.set()
+        assert cell.outcome(caught.value.lock_id) is not None
+
+
+def test_who_connects_while_the_disk_stands_still_reads_that_the_shard_runs(
+    daemon, endpoint, tmp_path, disk, monkeypatch
+):
+    """The shard is found, its welcome waits for the disk, and then time is up."""
+    daemon(endpoint, folder=tmp_path, durability="durable")
+    clock, greet = PassingTime(), discovery._Probe.greet
+
+    def greet_at_last(probe, found, hello, deadline_s):
+        answer = greet(probe, found, hello, clock.monotonic())  # asks for the shortest time
+        clock.passed_s = HOUR_S
+        return answer
+
+    monkeypatch.setattr(discovery, "time", clock)
+    monkeypatch.setattr(discovery._Probe, "greet", greet_at_last)
+    disk.clear()
+    with pytest.raises(ShardUnreachableError, match=r"s0 is running.*its disk"):
+        connect(endpoint, timeout_s=HOUR_S)
 
 
 def test_shard_whose_disk_stands_still_is_not_taken_for_dead(
-    daemon, endpoint, tmp_path, disk, monkeypatch
+    daemon, endpoint, tmp_path, disk, monkeypatch, until
 ):
-    """Neither who connects nor who registers an aspect is asked whether the shard runs."""
+    """It greets those it knows, and who registers a world is told that it runs."""
     shard = daemon(endpoint, folder=tmp_path, durability="durable")
-    monkeypatch.setattr(session_client, "FINISH_S", 0.5)
+    monkeypatch.setattr(
+        session_client, "CALL_S", HOUR_S
+    )  # the question whether it runs is answered
     with connect(endpoint) as cell:
         add_one(cell)
         disk.clear()
-
-        def connects():
-            with pytest.raises(ShardUnreachableError, match=r"s0 is running.*its disk"):
-                connect(endpoint, timeout_s=next(longer_s))
-
-        def registers():
-            request_timeout_s = next(longer_s)
-            with pytest.raises(ShardUnreachableError, match=r"it runs.*its disk") as caught:
-                cell._client.greet(timeout_s=request_timeout_s)
-                cell._client.register(worlds=("another",), timeout_s=request_timeout_s)
-            assert caught.value.shard == "s0"
-
-        # On a machine that stands still for as long, nobody has said anything in time.
-        for act in (connects, registers):
-            longer_s = (0.5 * 2**attempt for attempt in range(ATTEMPTS))
-            met_once(act)
+        cell._client.greet(timeout_s=HOUR_S)
+        with pytest.raises(ShardUnreachableError, match=r"it runs.*its disk") as caught:
+            cell._client.register(worlds=("another",), timeout_s=0.0)
+        assert caught.value.shard == "s0"
+        until(lambda: shard.host._shard.counters.get("disk_stalls"))
         disk.set()
-    assert shard.host._shard.counters["disk_stalls"] >= 1
 
 
 def test_disk_that_stands_still_is_told_to_the_log(daemon, endpoint, tmp_path, disk, caplog, until):

@@ -6,13 +6,14 @@ import signal
 import statistics
 import threading
 import time
+from types import SimpleNamespace
 
 import pytest
 from parked_parts import parked
-from quiet_moments import met_once
 from socket_parts import COUNT, CUP, add_one, carrier_of, over_socket
 
 from enact_dist import Entity, Lock, Write, connect
+from enact_dist.access import watch as watches
 from enact_dist.core.protocol.messages import (
     Hello,
     ListLocks,
@@ -22,8 +23,9 @@ from enact_dist.core.protocol.messages import (
 )
 from enact_dist.errors import ConfigError, LinkError
 from enact_dist.link.memory.shared_folder import open_shared
-from enact_dist.link.socket.carrier import SocketCarrier
+from enact_dist.link.socket.carrier import LATE_S, SocketCarrier
 from enact_dist.link.socket.line import SocketLine
+from enact_dist.link.socket.watcher import SKIP_S
 from enact_dist.link.zenoh.carrier import ZenohCarrier
 
 pytestmark = pytest.mark.carrier("auto")  # what is taken, and when, is what is tested
@@ -293,30 +295,33 @@ def test_waiting_threads_do_not_slow_a_fast_one(daemon, endpoint, until):
     assert min(beside_s) < 10 * min(alone_s), (beside_s, alone_s)
 
 
-def test_watch_lists_nothing_again_while_only_other_slots_change(daemon, endpoint, monkeypatch):
-    """That a number was skipped for it is told before it would be looked for."""
+def test_watch_lists_nothing_again_while_only_other_slots_change(
+    daemon, endpoint, until, monkeypatch
+):
+    """The numbers that it skips are told without another notice, before they count as missing."""
     daemon(endpoint)
     with connect(endpoint) as cell:
         request = add_one(cell)
-        world = cell.world("online")
-        with world.watch("somebody/else") as watch:
-            listed = []
+        with cell.world("online").watch("somebody/else") as watch:
+            listed, following, now_s = [], watch._following["s0"], 0.0
             monkeypatch.setattr(watch, "_list_again", lambda *_args, **_more: listed.append(1))
+            # For the watch time stands still, so that nothing is missing for long but by the test.
+            monkeypatch.setattr(watches, "time", SimpleNamespace(monotonic=lambda: now_s))
+            for _ in range(4):
+                with Lock(request) as lock:
+                    lock[request] += 1
+                cell._client.greet()
+                sent = cell._client.notice_numbers["s0"]
 
-            def attempt():
-                listed.clear()
-                following, began_s, passed_s = watch._following, time.monotonic(), 0.0
-                last = following["s0"].number + 10
-                while passed_s < 2.0 or following["s0"].number < last:
-                    assert passed_s < 60.0, "the numbers stand still"
-                    passed_s = time.monotonic() - began_s
-                    with Lock(request) as lock:
-                        lock[request] += 1
-                    assert watch.next(timeout_s=0.01) is None
-                assert listed == []  # unless all stood still for as long as a number may stay out
-                assert watch._following["s0"].epoch == cell._client.notice_numbers["s0"][0]
+                def follows(sent=sent):
+                    assert watch.next(timeout_s=0) is None
+                    return (following.epoch, following.number) >= sent
 
-            met_once(attempt)
+                until(follows)
+                now_s += 2 * LATE_S
+                assert watch.next(timeout_s=0) is None
+        assert listed == []
+    assert SKIP_S < LATE_S == watch._feed.late_s
 
 
 def test_carrier_says_what_went_over_what(daemon, endpoint, until):
