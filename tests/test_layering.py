@@ -301,6 +301,20 @@ def test_every_public_name_has_a_docstring(folder):
     assert silent == []
 
 
+def test_every_test_says_what_it_shows():
+    """The docstring adds to the name: one that repeats it would be none."""
+    silent, tests = [], 0
+    for file in python_files(ROOT / "tests"):
+        for node in ast.walk(ast.parse(file.read_text("utf-8"))):
+            if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
+                tests += 1
+                said = (ast.get_docstring(node) or "").lower().rstrip(".")
+                if said in {"", node.name.removeprefix("test_").replace("_", " ")}:
+                    silent.append(f"{file.relative_to(ROOT)}:{node.name}")
+    assert tests > 4000
+    assert silent == []
+
+
 def test_no_pickle_and_no_unfinished_marks():
     """Nothing is unpickled, and nothing is left to do in a comment."""
     marks = ("TO" + "DO", "FIX" + "ME", "XX" + "X")

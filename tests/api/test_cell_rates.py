@@ -275,6 +275,7 @@ def test_slots_that_a_shard_does_not_list_stay_as_they_were():
 
 
 def test_data_of_a_shard_that_is_away_stay_and_say_so():
+    """Once it is back, the rate is that of the whole time between."""
     looks, right = Looks(), slots("right", b=5)
     there = looks.add(Look(T0_S, shards=(shard(uptime_s=1.0), shard("right", uptime_s=1.0)),
                            slots=slots(a=10) | right))  # fmt: skip

@@ -56,10 +56,12 @@ def refused(text):
 
 
 def test_without_the_table_there_are_no_rights():
+    """A shard then asks no guard at all."""
     assert parsed(CELL).shard_settings("s").rights is None
 
 
 def test_rules_groups_users_and_operators_are_read():
+    """Each right of the example is given to those of its rule and to no one else."""
     rights = parsed(CELL + RIGHTS).shard_settings("s").rights
     assert rights.may("camera2", "read", "online/any/a/b")
     assert rights.may("@vision", "read", "training/cloud/view/1")
@@ -113,12 +115,14 @@ def test_rules_groups_users_and_operators_are_read():
     ],
 )
 def test_what_is_wrong_is_refused_by_line_with_a_suggestion(old, new, wrong):
+    """Names are compared with those of the cell, patterns and keys with what exists."""
     text = CELL + RIGHTS
     assert old in text
     assert wrong in refused(text.replace(old, new, 1))
 
 
 def test_a_rule_that_stands_twice_is_refused():
+    """By the numbers of both."""
     rule = '[[rights.allow]]\nwho = "planner"\nread = "online:**"\n'
     assert "rule 2 of [[rights.allow]] repeats rule 1" in refused(CELL + rule + rule)
 
@@ -131,6 +135,7 @@ def test_a_rule_that_stands_twice_is_refused():
     ],
 )
 def test_rights_where_any_program_can_claim_any_name_are_refused(old, new, wrong):
+    """Without rights the same endpoint and carrier are fine; the environment counts as well."""
     assert wrong in refused((CELL + RIGHTS).replace(old, new))
     parsed(CELL.replace(old, new))
     with pytest.raises(ConfigError, match="carrier = 'zenoh'"):
@@ -166,6 +171,7 @@ def test_names_that_two_could_have_are_refused(old, line, name, wrong):
 
 
 def test_the_tables_are_tables():
+    """A number in place of one is named by its key."""
     assert "'rights' is a table" in refused("rights = 3\n" + CELL)
     assert "'security' is a table" in refused("security = 3\n" + CELL.partition("[security]")[0])
 

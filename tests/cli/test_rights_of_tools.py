@@ -54,6 +54,7 @@ def run(cell, capsys, monkeypatch):
 
 @pytest.mark.parametrize("words", OBSERVING, ids=" ".join)
 def test_who_may_observe_sees_the_cell_and_others_read_why_not(run, words):
+    """What the observer may not read is not among it."""
     status, out, _ = run("reader", words)
     assert status == 0
     assert "secret" not in out
@@ -64,6 +65,7 @@ def test_who_may_observe_sees_the_cell_and_others_read_why_not(run, words):
 
 @pytest.mark.parametrize("words", SECRET, ids=" ".join)
 def test_what_is_not_readable_is_no_null(run, words):
+    """The same command on a readable slot works."""
     status, out, error = run("reader", words)
     assert (status, out) == (1, "")
     assert "reader may not read online:secret/x/count" in error
@@ -71,6 +73,7 @@ def test_what_is_not_readable_is_no_null(run, words):
 
 
 def test_lists_leave_out_what_is_not_readable(run):
+    """They count what is left, and a check of the shards needs no right."""
     for name, seen in (("ada", 2), ("reader", 1), ("blind", 0)):
         status, out, _ = run(name, ["world", "tree", "online"])
         assert status == 0

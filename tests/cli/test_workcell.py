@@ -8,6 +8,7 @@ import pytest
 
 
 def test_a_board_is_written_to_print(enact, tmp_path):
+    """In three formats, with its size and the option that a calibration needs."""
     for kind, head in (("png", b"\x89PNG"), ("svg", b"<svg"), ("pdf", b"%PDF")):
         file = tmp_path / "sheets" / f"board.{kind}"
 
@@ -34,6 +35,7 @@ def test_a_board_is_written_to_print(enact, tmp_path):
     ],
 )
 def test_what_cannot_be_done_is_one_line(enact, words, status, reason):
+    """Wrong words end with status 2, missing files and devices with 1."""
     result = enact("workcell", "calibrate", *words)
 
     assert result.status == status
@@ -42,6 +44,7 @@ def test_what_cannot_be_done_is_one_line(enact, words, status, reason):
 
 
 def test_pictures_without_a_board(enact, tmp_path):
+    """The board that was looked for is in the refusal, and nothing is printed."""
     for camera in "01":
         (tmp_path / "images" / camera).mkdir(parents=True)
         grey = np.full((120, 160), 120, np.uint8)
@@ -55,6 +58,7 @@ def test_pictures_without_a_board(enact, tmp_path):
 
 
 def test_missing_extra_is_named_with_its_command(enact, monkeypatch):
+    """Without OpenCV there is a line, no traceback."""
     monkeypatch.setitem(sys.modules, "cv2", None)
 
     result = enact("workcell", "calibrate", "--print-board", "b.png")
@@ -65,6 +69,7 @@ def test_missing_extra_is_named_with_its_command(enact, monkeypatch):
 
 
 def test_a_place_that_is_none(enact, capsys):
+    """The refusal gives an example of one."""
     with pytest.raises(SystemExit, match="2"):
         enact("workcell", "calibrate", "d", "--board-at", "1,2")
 

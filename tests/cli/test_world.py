@@ -71,6 +71,7 @@ def test_tree_shows_aspects_below_their_entities(at):
     ("pattern", "hint"), [("tray", "; tray/** matches "), ("camra", "; did you mean 'camera'?")]
 )
 def test_tree_of_nothing_names_what_there_is(at, pattern, hint):
+    """A pattern that would match, or the closest name."""
     (line,) = at("tree", "online", pattern).out.splitlines()
     assert line.startswith("online: none of its ")
     assert f"entities matches {pattern!r}{hint}" in line

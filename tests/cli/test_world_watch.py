@@ -221,6 +221,7 @@ def test_what_has_stopped_leaves_the_window_and_stays_in_the_whole():
 
 
 def test_one_change_has_no_rate():
+    """Neither in hertz nor in bytes: a rate needs two."""
     rates = Rates()
     rates.add(SLOT, at(1.0), 1.0)
 
@@ -229,6 +230,7 @@ def test_one_change_has_no_rate():
 
 
 def test_changes_that_are_never_asked_for_do_not_pile_up():
+    """Only those of the window stay; all of them are counted."""
     rates = SlotRates()
     for second in range(1000):
         rates.add(Sample(second * 10**9, 0, 0), float(second))

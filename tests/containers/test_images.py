@@ -26,6 +26,7 @@ def inspect(engine, images):
 
 @pytest.mark.parametrize("target", MEGABYTES_MAX)
 def test_an_image_is_small(inspect, target):
+    """Each stays below its own limit, so a heavy dependency is noticed."""
     size = inspect(target)["Size"] / 1e6
 
     assert size <= MEGABYTES_MAX[target], f"enact-{target}: {size:.0f} MB"
@@ -33,6 +34,7 @@ def test_an_image_is_small(inspect, target):
 
 @pytest.mark.parametrize("target", MEGABYTES_MAX)
 def test_an_image_says_what_it_is_and_starts_enact_without_a_shell(inspect, target):
+    """Its user is no root, and its label is its name."""
     config = inspect(target)["Config"]
 
     assert config["User"] == "10001:10001"
@@ -42,6 +44,7 @@ def test_an_image_says_what_it_is_and_starts_enact_without_a_shell(inspect, targ
 
 @pytest.mark.parametrize("target", MEGABYTES_MAX)
 def test_enact_runs_without_rights_on_a_read_only_root(engine, images, target):
+    """No network, no capability, and no folder to write but /tmp."""
     said = engine.docker(*BARE, f"enact-{target}", "--version").stdout
 
     assert said.startswith("enact-dist ")
@@ -116,6 +119,7 @@ def test_an_image_misses_nothing_but_what_was_left_out(engine, images, target):
 
 
 def test_only_the_image_that_makes_keys_has_what_makes_them(engine, images):
+    """A shard's image could not forge a certificate."""
     loads = "import cryptography; print('loaded')"
 
     assert python(engine, "keys", loads).stdout == "loaded\n"
@@ -123,18 +127,21 @@ def test_only_the_image_that_makes_keys_has_what_makes_them(engine, images):
 
 
 def test_core_has_no_open3d(engine, images):
+    """The small image comes without the large library."""
     done = python(engine, "core", "import open3d")
 
     assert "No module named 'open3d'" in done.stderr
 
 
 def test_a_write_outside_of_the_volumes_is_refused(engine, images):
+    """The folder of data is read-only, too, unless it is a volume."""
     done = python(engine, "core", "open('/var/lib/enact/note', 'w')")
 
     assert "Read-only file system" in done.stderr
 
 
 def test_a_fresh_volume_belongs_to_the_user_of_the_image(engine, images):
+    """No one has to change its owner first."""
     done = python(engine, "core", "open('/var/lib/enact/note', 'w')", "--volume", "/var/lib/enact")
 
     assert done.returncode == 0, done.stderr

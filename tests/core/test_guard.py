@@ -14,6 +14,7 @@ from enact_dist.core.protocol.records import Recovered
 from enact_dist.core.rights.guard import NOTED_MAX
 from enact_dist.core.rights.rules import UNPROVEN, Rights, Rule, data_path
 from enact_dist.core.shard.shard import Shard
+from enact_dist.core.state.slots import INLINE_BYTES_MAX
 from enact_dist.terms import Access
 
 CAM = "cam@h:1"
@@ -50,10 +51,10 @@ class GuardedBench(ShardBench):
 
         self.shard.handle = handle
 
-    def put(self, entity):
+    def put(self, entity, text="0"):
         """Write a datum by this process, which needs no right."""
         self.hello("host")
-        answer = self.write("host", len(self.notices) + 1, "0", to=slot(entity))
+        answer = self.write("host", len(self.notices) + 1, text, to=slot(entity))
         assert isinstance(answer, m.Committed), answer
 
     def asked(self, message):
@@ -107,6 +108,7 @@ def requests(bench):
 
 @pytest.mark.parametrize("row", requests(ShardBench()))
 def test_each_request_with_its_right_and_without(row):
+    """With its rights it is answered; without any one it is refused and counted, with no effect."""
     gives, _ = requests(ShardBench())[row]
     bench = GuardedBench(**gives)
     answer = bench.asked(requests(bench)[row][1])
@@ -127,6 +129,7 @@ def test_each_request_with_its_right_and_without(row):
 
 
 def test_this_process_and_operators_need_no_right():
+    """Both pass where the camera, which has no rule, would be refused."""
     bench = GuardedBench()
     assert isinstance(bench.ask(m.ListLocks()), m.Locks)
     assert isinstance(bench.ask_as("ada@h:2", m.Break(7, "why", bench.shard.epoch)), m.Broken)
@@ -169,6 +172,7 @@ def test_a_reader_changes_nothing_of_what_is_registered():
 
 
 def test_a_pattern_half_inside_a_rule_is_refused():
+    """A pattern has to lie within a rule, not just overlap with it."""
     bench = GuardedBench(read="online:view/*/count")
     assert isinstance(bench.acquired(Access.READ_EACH, "view/*"), m.Granted)
     assert refused(
@@ -178,6 +182,7 @@ def test_a_pattern_half_inside_a_rule_is_refused():
 
 
 def test_a_view_beside_a_lock_needs_its_own_right():
+    """The right to write one slot does not show another one."""
     bench = GuardedBench(write="online:piece/count")
     both = (item(Access.WRITE), item(Access.VIEW, "other"))
     answer = bench.asked(bench.acquire_request(lock_id("cam"), *both))
@@ -204,6 +209,7 @@ def written(bench, value, seq=1):
     ],
 )
 def test_a_commit_needs_the_right_for_what_is_there(has, value, there, needs):
+    """Null becomes a datum by `init`, a datum another one by `change`, and null by `delete`."""
     bench = GuardedBench(**{has: "online:piece/count"})
     if there:
         bench.put("piece")
@@ -218,6 +224,7 @@ def test_a_commit_needs_the_right_for_what_is_there(has, value, there, needs):
 
 
 def test_a_hostile_commit_of_what_the_lock_does_not_hold_changes_nothing():
+    """Its token is that of a lock on another slot."""
     bench = GuardedBench(write="online:piece/count")
     granted = bench.acquired(Access.WRITE)
     other = WriteItem(slot("other"), datum())
@@ -242,6 +249,7 @@ def test_nothing_is_prepared_without_the_right():
 
 
 def test_listings_leave_out_what_is_not_readable():
+    """A question about that slot alone is refused, since null would be a wrong answer."""
     bench = GuardedBench(read="online:piece/count", observe="**")
     for entity in ("piece", "secret"):
         bench.put(entity)
@@ -260,14 +268,18 @@ def test_listings_leave_out_what_is_not_readable():
 
 
 def test_a_large_datum_is_fetched_by_a_reader_or_under_its_own_lock():
+    """Who may only write it gets its bytes once a lock pins them, and not before."""
     bench = GuardedBench(write="online:piece/count", read="online:other/count")
     for entity in ("piece", "secret", "other"):
-        bench.put(entity)
+        bench.put(entity, "1" * (INLINE_BYTES_MAX + 1))
 
     def fetched(entity):
         return bench.asked(m.Fetch(lock_id("cam"), bench.shard.epoch, slot(entity), 1, 0, 9))
 
     assert isinstance(fetched("other"), m.Slice)
+    assert refused(fetched("piece"), "read", "online:piece/count")
+    assert isinstance(bench.acquired(Access.WRITE), m.Granted)
+    assert isinstance(fetched("piece"), m.Slice)
     assert refused(fetched("secret"), "read", "online:secret/count")
 
 
@@ -311,6 +323,7 @@ def test_a_request_asked_again_shows_nothing_that_is_no_longer_readable():
 
 
 def test_a_view_under_the_name_of_a_held_lock_needs_its_own_right():
+    """The name of a lock opens nothing beyond its own slots."""
     bench = GuardedBench(write="online:piece/count")
     assert isinstance(bench.acquired(Access.WRITE), m.Granted)
     hidden = (item(Access.VIEW, "secret"),)
@@ -319,6 +332,7 @@ def test_a_view_under_the_name_of_a_held_lock_needs_its_own_right():
 
 
 def test_a_name_without_proof_has_no_part_of_what_everybody_may():
+    """A rule for `*` holds for proven names only."""
     rights = Rights([Rule(("*",), (("change", "**"), ("read", "**")))])
     assert rights.may_write_some("anybody", "**")
     assert not rights.may_write_some(UNPROVEN, "**")
@@ -379,6 +393,7 @@ def test_what_another_session_has_pinned_is_not_fetched():
 
 
 def test_the_log_names_a_subject_and_a_right_once_a_second():
+    """Each right has its own line, and the next one counts what was left out."""
     bench = GuardedBench()
     for _ in range(5):
         bench.asked(m.ListLocks())
@@ -394,6 +409,7 @@ def test_the_log_names_a_subject_and_a_right_once_a_second():
 
 
 def test_refusals_can_be_listed_by_those_who_may_observe():
+    """With how often, and when first and last; the refused listing is an entry itself."""
     bench = GuardedBench()
     for _ in range(3):
         bench.asked(m.Break(7, "why", bench.shard.epoch))
@@ -405,6 +421,7 @@ def test_refusals_can_be_listed_by_those_who_may_observe():
 
 
 def test_of_more_refusals_than_are_kept_the_latest_stay():
+    """One that had to go and comes again begins at one."""
     bench = GuardedBench()
     for number in range(NOTED_MAX + 2):
         bench.asked(m.DropWorld("cam", f"w{number % (NOTED_MAX + 1)}", bench.shard.epoch))

@@ -36,6 +36,7 @@ def test_two_clocks_that_drift_apart_never_let_two_daemons_serve():
 
 
 def test_a_lease_never_gets_shorter():
+    """A confirmation that comes late, of an earlier moment, changes nothing."""
     lease = Lease(LEASE_NS)
     lease.confirmed(5 * S)
     until_ns = lease.until_ns
@@ -118,4 +119,5 @@ def test_a_holder_that_came_back_has_its_usual_lease(standby):
     ],
 )
 def test_the_row_says_what_became_of_a_batch(row, found):
+    """Our epoch and our number, our epoch and the number before, or another one's."""
     assert after_break(row[:2], epoch=7, batch=4) is found

@@ -68,6 +68,7 @@ def test_containment_is_never_wrongly_yes(outer, inner, names):
 
 @given(PATTERNS, NAMES)
 def test_a_name_is_contained_as_it_is_matched(pattern, name):
+    """Containment, the fast match and a plain one agree on every name."""
     assert pattern_contains(pattern, name) == pattern_matches(pattern, name)
     assert pattern_matches(pattern, name) == plainly_matches(pattern.split("/"), name.split("/"))
 
@@ -89,6 +90,7 @@ def test_a_name_is_contained_as_it_is_matched(pattern, name):
     ],
 )
 def test_containment_by_example(outer, inner, inside):
+    """The cases that a reader would ask about, in both directions."""
     assert pattern_contains(outer, inner) is inside
 
 
@@ -143,6 +145,7 @@ def test_a_decision_is_its_plain_definition(all_rules, requests):
 
 
 def test_new_rights_have_no_old_decision_and_old_ones_make_room(monkeypatch):
+    """What is asked often stays decided while thirty others pass."""
     before = Rights([Rule(("camera",), (("read", "on/x/a"),))])
     assert before.may("camera", "read", "on/x/a")
     assert not Rights([]).may("camera", "read", "on/x/a")
@@ -155,6 +158,7 @@ def test_new_rights_have_no_old_decision_and_old_ones_make_room(monkeypatch):
 
 
 def test_this_process_may_everything_and_an_unproven_name_nothing():
+    """Not even what a rule gives to `*`."""
     rights = Rights([Rule(("*",), (("read", "**"),))])
     assert rights.may("", "break", "**")
     assert rights.may("anybody", "read", "on/x/a")
@@ -187,16 +191,19 @@ def test_whose_rights_a_user_of_the_host_has():
     ],
 )
 def test_data_are_named_by_world_entities_and_aspect(text, path):
+    """The aspect stands second, so that patterns of entities come last."""
     assert data_path(text) == path
 
 
 @pytest.mark.parametrize("text", ["online", "online:joints", ":a/b", "online:a/", "**:a/b", ""])
 def test_what_names_no_data_is_refused(text):
+    """A part is missing or empty, or the world context is `**`."""
     with pytest.raises(ValueError, match="names no data"):
         data_path(text)
 
 
 def test_a_fork_names_source_and_world():
+    """Exactly one arrow, with a name on both sides."""
     assert fork_path("online -> what_if*") == "online/what_if*"
     for text in ("online", "a -> b -> c", "-> b", "a/b -> c"):
         with pytest.raises(ValueError, match="names no fork"):

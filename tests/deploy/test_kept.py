@@ -23,6 +23,7 @@ def fill(folder):
 
 
 def test_a_second_call_finds_what_the_first_made():
+    """Its own recipe is not followed again."""
     first = kept.kept("thing", "recipe", fill)
     second = kept.kept("thing", "recipe", pytest.fail)
 
@@ -31,6 +32,7 @@ def test_a_second_call_finds_what_the_first_made():
 
 
 def test_another_recipe_is_made_anew():
+    """In a folder of its own, so neither takes the place of the other."""
     assert kept.kept("thing", "one", fill) != kept.kept("thing", "other", fill)
 
 
@@ -48,9 +50,15 @@ def test_what_could_not_be_made_leaves_nothing():
     assert (kept.kept("thing", "recipe", fill) / "one").exists()
 
 
-def test_who_comes_while_it_is_made_waits_and_has_it():
-    making, go_on = threading.Event(), threading.Event()
-    found = []
+def test_who_comes_while_it_is_made_waits_and_has_it(monkeypatch):
+    """The second asks for the lock before the first has filled the folder."""
+    making, asked, go_on = threading.Event(), threading.Event(), threading.Event()
+    found, flock = [], kept.fcntl.flock
+
+    def asks(file, operation):
+        if threading.current_thread() is second:
+            asked.set()
+        flock(file, operation)
 
     def slowly(folder):
         making.set()
@@ -63,7 +71,9 @@ def test_who_comes_while_it_is_made_waits_and_has_it():
     second = threading.Thread(
         target=lambda: found.append(kept.kept("thing", "recipe", pytest.fail))
     )
+    monkeypatch.setattr(kept.fcntl, "flock", asks)
     second.start()
+    assert asked.wait(30)
     go_on.set()
     first.join(30)
     second.join(30)
@@ -72,6 +82,7 @@ def test_who_comes_while_it_is_made_waits_and_has_it():
 
 
 def test_a_missing_program_is_named(capfd):
+    """With the package that brings it, and without a traceback."""
     with pytest.raises(SystemExit):
         kept.run("no-such-program-of-ours")
 
@@ -79,6 +90,7 @@ def test_a_missing_program_is_named(capfd):
 
 
 def test_images_shows_its_help():
+    """It starts as a program of its own and lists its options."""
     done = subprocess.run(
         [sys.executable, str(DEPLOY / "images"), "--help"],
         capture_output=True,

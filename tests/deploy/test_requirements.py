@@ -48,6 +48,7 @@ def left_out_of(lock):
 
 @pytest.mark.parametrize("lock", LOCKS)
 def test_a_lock_holds_what_the_project_asks_for(lock):
+    """A bound that was raised in pyproject.toml alone is noticed."""
     pinned = pins(lock)
     for requirement in asked(lock):
         version = pinned.get(canonicalize_name(requirement.name))
@@ -56,6 +57,7 @@ def test_a_lock_holds_what_the_project_asks_for(lock):
 
 @pytest.mark.parametrize("lock", LOCKS)
 def test_every_pin_names_the_hashes_of_its_files(lock):
+    """A registry cannot replace a file under its version."""
     entries = re.split(r"^(?=[\w.-]+==)", (FOLDER / lock).read_text("utf-8"), flags=re.MULTILINE)
 
     assert len(entries) > 1
@@ -72,6 +74,7 @@ def test_all_images_have_the_same_core(lock):
 
 @pytest.mark.parametrize("lock", ["perception.txt", "workcell.txt"])
 def test_what_is_left_out_is_in_no_lock(lock):
+    """It does not return through what another package needs."""
     left_out = left_out_of(lock)
 
     assert left_out

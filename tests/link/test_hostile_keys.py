@@ -257,6 +257,7 @@ def test_act_without_its_right_names_it_and_leaves_nothing(tmp_path, way):
 
 
 def test_secret_of_any_characters_is_compared():
+    """One that is not ASCII, or empty, is wrong and no error."""
     session = new_session_id("ben")
 
     assert not opens("\N{SNOWMAN}" * 40, session)

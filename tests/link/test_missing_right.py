@@ -19,6 +19,7 @@ def error(right, what, subject="camera"):
 
 
 def test_the_error_names_subject_right_slot_and_rule():
+    """In words for people, and in attributes for programs."""
     found = error("write", shown(Slot("online", "plan/1", "joints")))
     assert isinstance(found, PermissionDeniedError)
     assert str(found) == (
@@ -34,6 +35,7 @@ def test_the_error_names_subject_right_slot_and_rule():
     [("break", "locks"), ("fork", "online -> w"), ("keep", "day/1"), ("write", "aspect joints")],
 )
 def test_a_right_on_no_slot_leaves_the_slot_out(right, what):
+    """Locks, worlds, labels and aspects have no slot."""
     found = error(right, what, "@vision")
     assert isinstance(found, PermissionDeniedError)
     assert (found.identity, found.right, found.rule) == ("@vision", right, "cell.toml, line 41")
@@ -41,12 +43,14 @@ def test_a_right_on_no_slot_leaves_the_slot_out(right, what):
 
 
 def test_a_name_without_proof_may_try_again():
+    """A `LinkError`: over the socket, the same name could be proven."""
     found = error("read", "online:a/b", UNPROVEN)
     assert isinstance(found, LinkError)
     assert "camera@h:1 asked to read online:a/b over Zenoh" in str(found)
 
 
 def test_another_ones_session_names_no_right():
+    """It is refused as forbidden, though no rule would allow it."""
     found = error_of(
         Refused("permission", "session a belongs to b; c asked and may not speak for it")
     )

@@ -70,6 +70,7 @@ def put(cell, entity, value):
 
 
 def test_names_of_one_user_have_their_rights_over_the_socket(tmp_path):
+    """Four names of this user differ in what they may; the error carries slot and rule."""
     with guarded(tmp_path) as (shard, file):
         with connect(file, actor="camera") as camera:
             put(camera, "view/1", 1)
@@ -196,6 +197,7 @@ def test_a_reload_changes_whose_rights_a_connection_uses(tmp_path, monkeypatch):
 
 
 def test_a_user_without_an_entry_is_refused_by_number(tmp_path):
+    """One with an entry has its name or group, and may use none of the others."""
     with guarded(tmp_path) as (shard, _):
         subject_of = shard._sockets._subject_of
         assert subject_of("joe@h:1", PeerCredentials(7, 1001, 1)) == "camera"

@@ -91,4 +91,5 @@ def test_two_names_of_one_server_are_one_host(server):
     ],
 )
 def test_no_password_is_shown(url, shown):
+    """Before the host or among the parameters, whatever signs it contains."""
     assert without_password(url) == shown

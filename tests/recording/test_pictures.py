@@ -236,6 +236,7 @@ def test_capsules_are_cylinders_with_spheres_at_their_ends():
 
 
 def test_a_trajectory_is_one_line_of_a_scene():
+    """In its frame, place by place; what is no path is named as unfit."""
     path_m = np.stack([np.eye(4), TURNED])
     (entity,) = shown(path_m, "trajectory", frame="cell")[""].entities
     (line,) = entity.lines

@@ -41,6 +41,7 @@ HAPPENED = (
 
 
 def test_no_seed_loses_doubles_or_invents_an_update():
+    """New seeds each run; every kind of event has to happen in some of them."""
     first = int(os.environ.get("ENACT_SIM_FIRST", "0")) or fresh_seed()
 
     totals = run_series(first, seconds=SECONDS, at_least=SEEDS_MIN, run=run_takeover)
@@ -158,6 +159,7 @@ WRONG = {
 
 @pytest.mark.parametrize("wrong", WRONG, ids=lambda wrong: wrong.__name__)
 def test_a_wrong_edit_is_caught(monkeypatch, wrong):
+    """The judges fail with each edit: a seed known for it is tried before others."""
     wrong(monkeypatch.setattr)
     seeds = (WRONG[wrong], *range(CAUGHT_WITHIN))
 
@@ -196,6 +198,7 @@ def test_a_failover_of_the_database_costs_no_takeover(seed):
 
 
 def test_a_standby_that_counts_over_an_outage_takes_the_shard(monkeypatch):
+    """Without `was_away` the failover above costs takeovers."""
     monkeypatch.setattr(lease.Standby, "was_away", lambda _self: None)
 
     taken = [

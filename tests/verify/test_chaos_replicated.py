@@ -40,6 +40,7 @@ def answered(folder, epoch, *times_ns):
 
 
 def test_answers_before_the_next_epoch_are_no_anomaly(folder):
+    """All four answers count, none of them as late."""
     answered(folder, 7, 2 * S, 5 * S)
     answered(folder, 8, 6 * S, 60 * S)
 
@@ -64,6 +65,7 @@ def test_answer_of_an_old_daemon_is_named(folder):
 
 
 def test_ring_keeps_the_newest_answers(tmp_path):
+    """Of more than it holds, the oldest make room, and all are counted."""
     path = tmp_path / "a.answers"
     times = AnswerTimes(path)
     times.serves(3)
@@ -96,6 +98,7 @@ def test_ring_keeps_the_newest_answers(tmp_path):
     ],
 )
 def test_end_of_a_daemon_is_an_anomaly_unless_it_may_end_so(tmp_path, ordered, status, said, why):
+    """Its status, the words of this start alone and whether it was ordered decide."""
     hosts = Loopback(("h0", "h1"), why="none is wanted")
     with closing(hosts), closing(Journal(tmp_path / evidence.FAULTS)) as log:
         cell = ReplicatedCell(
@@ -116,6 +119,7 @@ def test_end_of_a_daemon_is_an_anomaly_unless_it_may_end_so(tmp_path, ordered, s
 
 
 def test_way_opens_with_the_last_of_its_cuts():
+    """Two cuts of one way are made once and healed once."""
     done = []
     hosts = SimpleNamespace(
         cut=lambda *way: done.append(("cut", *way)), heal=lambda *way: done.append(("heal", *way))
@@ -132,6 +136,7 @@ def test_way_opens_with_the_last_of_its_cuts():
 
 
 def test_store_that_cannot_be_used_is_named_without_its_password():
+    """The error shows user, host and database."""
     pytest.importorskip("psycopg")
     with pytest.raises(LinkError, match=r"postgresql://me@127\.0\.0\.1:9/x ") as found:
         _forget("postgresql://me:secret@127.0.0.1:9/x", "chaos")
@@ -139,6 +144,7 @@ def test_store_that_cannot_be_used_is_named_without_its_password():
 
 
 def test_namespaces_cannot_be_required_for_a_database_of_others(tmp_path):
+    """The refusal names the option that has a database of its own."""
     settings = runner.ChaosSettings(
         1.0, 1, namespaces_required=True, store="postgresql://me@127.0.0.1:9/x"
     )

@@ -101,5 +101,6 @@ def test_a_datum_may_hold_an_arm_and_its_path():
 
 
 def test_an_arm_without_capsules_is_not_drawn():
+    """Its path has no nodes, and no error."""
     model = Model(np.array([[0.0, 1.0, 0.0, 0.0]] * 2), BASE, np.zeros((0, 5)))
     assert path_of(np.zeros(2), model, "joints").nodes == {}

@@ -44,6 +44,7 @@ def test_frames_of_entities_that_have_gone_are_removed():
 
 
 def test_points_of_one_colour_are_moved_and_others_sent_again():
+    """Another colour or size, or a colour for each point, makes a new cloud."""
     client = MagicMock()
     canvas, cloud = Canvas(client), client.scene.add_point_cloud
     red, blue, each = (200, 0, 0), (0, 0, 200), np.zeros((7, 3), np.uint8)

@@ -94,6 +94,7 @@ def test_a_datum_counts_for_the_limit_of_bytes_before_it_was_ever_shown(cell):
 
 
 def test_what_the_past_has_shown_is_not_fetched_again(cell, monkeypatch):
+    """At a later moment only the slot that changed in between is fetched."""
     position, source, fetched = move(cell, 1.0), CellSource(cell), []
     fetch = HeldView.fetch
 
@@ -159,6 +160,7 @@ def test_an_odd_datum_is_named_and_takes_no_other_with_it(cell, feed, monkeypatc
 
 
 def test_the_feed_outlives_whatever_its_watch_raises(cell, feed, monkeypatch):
+    """It names the error, begins another watch and then shows data without the error."""
     real, failures = feeds.Watch, [RuntimeError("out of luck")]
 
     def watch(*given, **options):
@@ -174,6 +176,7 @@ def test_the_feed_outlives_whatever_its_watch_raises(cell, feed, monkeypatch):
 
 
 def test_the_moment_goes_on_while_nothing_that_is_shown_changes(cell, feed):
+    """A commit to another slot moves it."""
     feed.wish("page", [SPEED_SLOT])
     until(lambda: feed.shown([SPEED_SLOT]))
     position = move(cell, 1.0)
@@ -195,6 +198,7 @@ def test_world_contexts_are_those_of_the_cell(cell):
 
 
 def test_an_unknown_world_context_is_refused_with_those_there_are(cell, tmp_path):
+    """Of a running cell as of a recording."""
     with pytest.raises(UnknownWorldError, match=r"'nosuch'.* \(it has online, truth\)"):
         Viewer(cell, ViewSettings(world="nosuch"))
     name, content = recording_of(CellSource(cell), "online", move(cell, 1.0).stamp_ns, SHOWS)
@@ -204,6 +208,7 @@ def test_an_unknown_world_context_is_refused_with_those_there_are(cell, tmp_path
 
 
 def test_the_past_is_exact_and_forgotten_data_are_named(cell, feed):
+    """A datum is decoded once per version, and what retention dropped is left out by name."""
     positions = [move(cell, float(x_m)) for x_m in range(1, 7)]
     feed.wish("page", [SLOT])
     until(lambda: feed.catalogue.slots("online") == [SLOT, SPEED_SLOT])
@@ -312,6 +317,7 @@ def test_a_difference_with_the_present_is_made_when_its_data_change(
 def test_a_slow_difference_takes_a_tenth_of_the_time_and_a_choice_is_shown_at_once(
     cell, feed, monkeypatch
 ):
+    """A new commit waits for the pause; a new moment or world context does not."""
     feed.wish("page", [])
     before = move(cell, 1.0)
     until(lambda: feed.catalogue.state(SLOT))
@@ -328,6 +334,7 @@ def test_a_slow_difference_takes_a_tenth_of_the_time_and_a_choice_is_shown_at_on
 
 
 def test_a_difference_that_failed_is_tried_again_after_a_pause(cell, feed, monkeypatch):
+    """Until the pause is over, the page keeps the reason."""
     feed.wish("page", [])
     before = move(cell, 1.0)
     until(lambda: feed.catalogue.state(SLOT))
@@ -343,6 +350,7 @@ def test_a_difference_that_failed_is_tried_again_after_a_pause(cell, feed, monke
 
 
 def test_causes_are_steps_and_a_label_keeps_them(cell, feed):
+    """The first step is the datum itself, and the label pins what the tree shows."""
     move(cell, 1.0)
     feed.wish("page", [SLOT])
     until(lambda: feed.shown([SLOT]))
@@ -354,6 +362,7 @@ def test_causes_are_steps_and_a_label_keeps_them(cell, feed):
 
 
 def test_numbers_have_the_history_of_their_datum(cell):
+    """In the order of the commits, until the slot is no longer shown."""
     speed = Write(cell.world("online"), ARM, SPEED)
     for value in (1.0, 2.0):
         with Lock(speed) as lock:
@@ -366,6 +375,7 @@ def test_numbers_have_the_history_of_their_datum(cell):
 
 
 def test_locks_actors_and_shards_are_tables(cell, feed):
+    """A held lock appears with its holder, and an entry with its cause."""
     feed.wish("page", [SLOT])
     until(lambda: feed.catalogue.slots("online"))
     activity = Activity(CellSource(cell), feed.catalogue)

@@ -219,6 +219,7 @@ def test_a_default_port_that_is_taken_is_told_with_the_next_one():
 
 @pytest.mark.parametrize("option", ["--rate", "--bytes"])
 def test_a_bound_of_zero_is_refused_in_its_own_words(option, capsys):
+    """By the option's name, before anything is connected."""
     with pytest.raises(SystemExit):
         main(["view", "cell.toml", option, "0"])
     assert f"argument {option}: '0' is no number above zero" in capsys.readouterr().err
@@ -226,6 +227,7 @@ def test_a_bound_of_zero_is_refused_in_its_own_words(option, capsys):
 
 @pytest.mark.parametrize("factor", ["0.2", "1.5", "nan", "half"])
 def test_a_resolution_out_of_range_is_refused(factor, capsys):
+    """Too small, above one, and what is no number."""
     with pytest.raises(SystemExit):
         main(["view", "cell.toml", "--resolution", factor])
     assert f"argument --resolution: {factor!r} is no " in capsys.readouterr().err

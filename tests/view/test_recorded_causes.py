@@ -81,6 +81,7 @@ def test_trees_are_those_of_the_cell(cell, tmp_path, depth):
 
 
 def test_what_was_not_recorded_is_named(cell, tmp_path):
+    """A cause in a world context that was left out stands in the tree, unknown."""
     source = recorded(cell, tmp_path / "run.mcap", worlds=["online"])
     tree = source.tree_of("why", newest(source, "online", "system", "report"), 4)
     (other,) = (one for one in tree.walk() if one.world == "truth")
@@ -90,6 +91,7 @@ def test_what_was_not_recorded_is_named(cell, tmp_path):
 
 
 def test_a_page_shows_the_tree_and_goes_to_its_steps(cell, tmp_path):
+    """A step in another world context changes to it, and to the moment of that commit."""
     source = recorded(cell, tmp_path / "run.mcap")
     with Viewer(source, ViewSettings(SHOWS, "online")) as viewer:
         page = Page(viewer, QuietClient())

@@ -102,6 +102,7 @@ def test_a_robot_stands_as_its_joints_say(file):
 
 
 def test_joints_with_names_come_in_any_order(file):
+    """With names beside the aspect, each value moves the joint of its name."""
     assert places(scene_at([0.1, 0.0], file, joints=("slide", "shoulder")))["finger"] == [
         1.1,
         0,
@@ -118,6 +119,7 @@ def test_joints_with_names_come_in_any_order(file):
     ],
 )
 def test_joints_of_another_robot_are_named(file, positions, options, said):
+    """Too few, too many or other names: the remark lists what the file has and what came."""
     scene = scene_at(positions, file, **options)
     assert scene.nodes == {}
     (remark,) = scene.remarks
@@ -138,6 +140,7 @@ def test_joints_of_another_robot_are_named(file, positions, options, said):
     ],
 )
 def test_what_is_wrong_with_a_file_is_on_the_page(file, text, said):
+    """Each time, with the file's path; no robot is drawn."""
     file.write_text(text, "utf-8")
     for _ in range(2):
         scene = scene_at([0.0, 0.0], file)
@@ -148,6 +151,7 @@ def test_what_is_wrong_with_a_file_is_on_the_page(file, text, said):
 
 
 def test_a_file_that_comes_later_is_read_with_its_meshes(tmp_path):
+    """A missing file is not remembered as missing."""
     file = tmp_path / "later.urdf"
     (remark,) = scene_at([0.0, 0.0], file).remarks
     assert remark == f"online:thing/x v1: cannot read {file}: No such file or directory"
@@ -159,6 +163,7 @@ def test_a_file_that_comes_later_is_read_with_its_meshes(tmp_path):
 
 
 def test_a_missing_library_is_named_with_the_extra_that_brings_it(file, monkeypatch):
+    """The page stays; only the robot is left out."""
     monkeypatch.setattr("enact_dist.view.drawing.robots.find_spec", lambda _: None)
     file.write_text(ROBOT + "<!-- read anew -->", "utf-8")
     (remark,) = scene_at([0.0, 0.0], file).remarks
@@ -167,6 +172,7 @@ def test_a_missing_library_is_named_with_the_extra_that_brings_it(file, monkeypa
 
 
 def test_a_robot_that_moves_is_not_sent_again(file, monkeypatch):
+    """Its shapes get new poses."""
     canvas, added = Canvas(QuietClient()), []
     monkeypatch.setattr(
         canvas, "_scene", Recorder(lambda *_, **__: added.append(Handle()) or added[-1])
@@ -191,6 +197,7 @@ class Recorder:
 
 
 def test_a_file_is_named_relative_to_the_cell():
+    """Not to the folder in which a tool was started."""
     text = (
         'name = "c"\n[shards.s]\nlisten = "tcp/127.0.0.1:7447"\n[aspects.joints]\n'
         'shows = "joints"\nurdf = "models/arm.urdf"\n'
@@ -201,5 +208,6 @@ def test_a_file_is_named_relative_to_the_cell():
 
 @pytest.mark.parametrize("options", [{"kinds": ("pose",)}, {"kinds": ("joints",), "model": "m"}])
 def test_a_robot_is_drawn_by_joints_alone(options):
+    """A URDF beside another kind, or beside a model, is refused."""
     with pytest.raises(ConfigError, match="needs shows"):
         Shows(urdf=Path("arm.urdf"), **options)

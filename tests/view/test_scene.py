@@ -75,6 +75,7 @@ def one_node(data):
 
 
 def test_frames_stand_where_their_chain_of_transforms_leads():
+    """Two translations add up; only the frame without a parent is a root."""
     chain = {"hand": InParent("arm", moved(1.0)), "arm": InParent("cell", moved(0.0, 2.0))}
     found = placed(chain, ["hand"])
     assert found.poses["hand"][:3, 3].tolist() == [1.0, 2.0, 0.0]
@@ -91,6 +92,7 @@ def test_frames_without_a_common_root_and_circles_are_named():
 
 
 def test_a_transform_moves_what_stands_in_its_frame():
+    """Its parent and the cloud's frame are linked by the entity's name alone."""
     place = shown(moved(5.0), "transform", entity="tray", parent="cell")
     cloud = shown(Cloud(np.zeros((2, 3))), entity="pack", frame="tray")
     scene = scene_of({one.recorded.slot: one for one in (place, cloud)})
@@ -103,6 +105,7 @@ def test_a_transform_moves_what_stands_in_its_frame():
 
 
 def test_a_cloud_keeps_its_colours_and_loses_what_is_not_finite():
+    """The colour of a point goes with it, so the rest keep their own."""
     points = np.array([[0, 0, 0], [np.nan, 0, 0], [1, 1, 1]], np.float32)
     colours = np.array([[1, 2, 3], [4, 5, 6], [7, 8, 9]], np.uint8)
     node = one_node(shown(Cloud(points, colours)))
@@ -111,6 +114,7 @@ def test_a_cloud_keeps_its_colours_and_loses_what_is_not_finite():
 
 
 def test_a_cloud_without_colours_is_lighter_where_it_is_higher():
+    """A single point far away does not make the others dark; a flat cloud has one colour."""
     points = np.zeros((101, 3))
     points[:, 2] = np.arange(101.0)
     points[7, 2] = 1e30
@@ -128,6 +132,7 @@ def test_an_empty_cloud_is_no_node():
 
 
 def test_a_large_cloud_is_thinned_and_the_page_says_so():
+    """One point more than twice the limit leaves one in three."""
     cloud = shown(Cloud(np.zeros((scenes.POINTS_MAX * 2 + 1, 3), np.float32)))
     scene = scene_of({cloud.recorded.slot: cloud})
     (node,) = scene.nodes.values()
@@ -136,6 +141,7 @@ def test_a_large_cloud_is_thinned_and_the_page_says_so():
 
 
 def test_a_mesh_loses_triangles_of_vertices_that_it_has_not():
+    """The triangle that names a fourth vertex goes, the other one stays."""
     mesh = shown(Mesh(np.eye(3), np.array([[0, 1, 2], [0, 1, 3]])))
     node = one_node(mesh)
     assert isinstance(node, SurfaceNode)
@@ -143,12 +149,14 @@ def test_a_mesh_loses_triangles_of_vertices_that_it_has_not():
 
 
 def test_voxels_are_cubes_around_their_middles():
+    """Index and edge length give the middle, in metres."""
     node = one_node(shown(Occupied(np.array([[1, 0, 0]]), 0.5)))
     assert isinstance(node, CubesNode)
     assert node.centres_m.tolist() == [[0.75, 0.25, 0.25]]
 
 
 def test_many_voxels_are_square_points():
+    """Those inside a block cannot be seen and are left out."""
     grid = np.stack(np.meshgrid(*[np.arange(16)] * 3), axis=-1).reshape(-1, 3)
     node = one_node(shown(Occupied(grid, 0.5)))
     assert isinstance(node, PointsNode)
@@ -172,6 +180,7 @@ def test_voxels_that_are_left_out_have_no_face(dense_times, voxels):
 
 
 def test_capsules_are_spheres_and_cylinders():
+    """A capsule has a sphere of its diameter at each end and a cylinder between them."""
     rows = np.array([[0, 0, 0, 0, 0, 2.0, 0.25]])
     node = one_node(shown(rows, "capsules"))
     assert isinstance(node, CapsulesNode)
@@ -182,6 +191,7 @@ def test_capsules_are_spheres_and_cylinders():
 
 
 def test_a_datum_that_does_not_fit_its_kind_is_left_out_and_named():
+    """There is a remark for each of its kinds, and no node."""
     wrong = shown(np.zeros(4), "capsules", "trajectory")
     assert scene_of({wrong.recorded.slot: wrong})[::2] == (
         {},
@@ -215,6 +225,7 @@ class Planned:
     ],
 )
 def test_a_trajectory_is_a_line_through_its_places(path):
+    """Places, poses, transforms or a plan; a place that is not finite is left out."""
     node = one_node(shown(path, "trajectory", frame="cell"))
     assert isinstance(node, LineNode)
     assert (node.frame, node.places_m.tolist()) == ("cell", PLACES_M.tolist())
@@ -232,21 +243,25 @@ def test_a_trajectory_is_a_line_through_its_places(path):
     ],
 )
 def test_what_is_no_path_does_not_fit_a_trajectory(path):
+    """Wrong columns, whole numbers, quaternions that are not of length 1, no transforms."""
     assert shown(path, "trajectory").drawables == {"trajectory": None}
 
 
 def test_a_path_of_two_coordinates_lies_at_height_0():
+    """A path on the floor needs no third column."""
     node = one_node(shown(PLACES_M[:, :2].astype(np.float32), "trajectory", frame="cell"))
     assert node.places_m.tolist() == (PLACES_M * (1.0, 1.0, 0.0)).tolist()
 
 
 def test_a_path_of_less_than_two_places_or_too_far_away_is_no_line():
+    """It fits its kind, so there is no remark either."""
     for path in (np.zeros((0, 3)), np.zeros((1, 3)), np.full((2, 3), 1e300)):
         found = scene_of({slot("thing"): shown(path, "trajectory")})
         assert (found.nodes, found.remarks) == ({}, ())
 
 
 def test_a_long_path_is_thinned_and_keeps_its_ends():
+    """The remark gives both numbers, and the extent still reaches the last place."""
     path = np.arange(3.0 * 25_000).reshape(-1, 3)
     scene = scene_of({slot("thing"): shown(path, "trajectory")})
     (node,) = scene.nodes.values()
@@ -259,6 +274,7 @@ def test_a_long_path_is_thinned_and_keeps_its_ends():
 
 
 def test_a_colour_of_a_difference_replaces_that_of_the_datum():
+    """Also where each point has a colour; `linear` gives it in linear light."""
     cloud = shown(Cloud(np.zeros((1, 3)), np.zeros((1, 3), np.uint8)))
     scene = scene_of({cloud.recorded.slot: cloud}, tints={cloud.recorded.slot: (255, 150, 0)})
     (node,) = scene.nodes.values()
@@ -344,11 +360,13 @@ def test_pictures_of_one_image_with_masks_of_many_versions_are_few():
     ],
 )
 def test_images_of_numbers_are_grey(pixels, corner):
+    """Bytes stay as they are; other numbers are stretched, and what is not finite is black."""
     node = one_node(shown(pixels, "image"))
     assert node.image[0, 0].tolist() == corner
 
 
 def test_a_large_image_is_made_small():
+    """Both sides shrink by the same factor."""
     node = one_node(shown(np.zeros((480, 640, 3), np.uint8), "image"))
     assert node.image.shape == (240, 320, 3)
 
@@ -376,6 +394,7 @@ def test_an_image_is_as_large_as_its_side_asks_and_its_mask_fits_it(box, packs):
 
 
 def test_a_pose_leaves_a_trail_that_a_step_back_ends():
+    """It begins with the second place and does not return with the earlier moment."""
     trails = Trails()
     nodes = [{"p": AxesNode("cell", moved(x_m))} for x_m in (0.0, 1.0, 2.0)]
     assert trails.follow(nodes[0], 1) == {}
@@ -385,6 +404,7 @@ def test_a_pose_leaves_a_trail_that_a_step_back_ends():
 
 
 def test_labels_stand_at_their_entities():
+    """In the middle of what is drawn, in its frame; an entity that is not drawn has none."""
     cloud = shown(
         Cloud(np.array([[0, 0, 0], [2, 0, 0]], np.float32)), entity="pack/1", frame="tray"
     )
@@ -403,6 +423,7 @@ def test_a_mesh_is_a_file_that_others_read():
 
 
 def test_an_image_is_a_png_in_full_size():
+    """The file is not thinned as the picture on the page is."""
     imageio = pytest.importorskip("imageio.v3")
     pixels = np.arange(400 * 3, dtype=np.uint8).reshape(1, 400, 3)
     content = png_of(shown(pixels, "image"))
@@ -411,11 +432,13 @@ def test_an_image_is_a_png_in_full_size():
 
 @pytest.mark.parametrize("make", [ply_of, png_of])
 def test_a_datum_without_a_shape_is_no_file(make):
+    """The refusal says how the datum is shown instead."""
     with pytest.raises(ConfigError, match="is shown as json"):
         make(shown(1.5))
 
 
 def test_an_empty_image_is_no_file():
+    """An image without rows is refused in words, not by the encoder."""
     with pytest.raises(ConfigError, match=r"the image of .* is empty"):
         png_of(shown(np.zeros((0, 3), np.uint8), "mask"))
 

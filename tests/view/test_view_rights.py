@@ -35,6 +35,7 @@ def put(cell, value):
 
 
 def test_what_is_not_readable_is_named_beside_the_rest(file, monkeypatch):
+    """Live as in the past; what is readable goes on being shown."""
     with connect(file, actor="ada") as ada:
         put(ada, 1)
         monkeypatch.setenv("ENACT_IDENTITY", "reader")
@@ -71,6 +72,7 @@ def test_history_of_what_is_not_readable_takes_no_other_with_it(file, monkeypatc
 
 
 def test_without_the_right_to_observe_it_ends(file, capsys, monkeypatch):
+    """With the reason, before a page is served."""
     monkeypatch.setenv("ENACT_IDENTITY", "blind")
     assert main(["view", str(file)]) == 1
     assert "blind may not observe the cell" in capsys.readouterr().err
