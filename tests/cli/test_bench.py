@@ -1,6 +1,7 @@
 """`enact bench`: what it prints, what JSON has, how it ends.  No time is judged here."""
 
 import contextlib
+import functools
 import json
 import os
 import signal
@@ -14,12 +15,18 @@ from polling import until
 from enact_dist.bench import command
 from enact_dist.bench.place import Place
 from enact_dist.bench.rows import Row
-from enact_dist.bench.run import Answer
+from enact_dist.bench.run import Answer, Run
 from enact_dist.cli import bench
 from enact_dist.errors import LinkError, ShardUnreachableError
 
 FIELDS = ["name", "variant", "median_us", "p99_us", "n", "ratio", "goal", "met"]
 SHORT = ("--seconds", "0.03")
+
+
+@pytest.fixture
+def one_round(monkeypatch):
+    """Measure each case once: what a second round adds is shown by the short benches."""
+    monkeypatch.setattr(Run, "measure", functools.partialmethod(Run.measure, rounds=1))
 
 
 def rows_of(result):
@@ -109,6 +116,7 @@ def test_five_figures_stand_before_the_table(capsys):
 
 @pytest.mark.slow
 @pytest.mark.sampled(1, of="file")
+@pytest.mark.usefixtures("one_round")
 def test_daemons_and_workers_are_started_and_ended(enact, tmp_path, monkeypatch):
     """Benches between processes, over a throw-away cell of two shards; nothing is left behind."""
     monkeypatch.setenv("TMPDIR", str(tmp_path))
@@ -135,6 +143,7 @@ def test_running_cell_is_measured(enact, cell_file):
 
 @pytest.mark.slow
 @pytest.mark.sampled(1, of="file")
+@pytest.mark.usefixtures("one_round")
 def test_payloads_are_fetched_and_published_in_the_process(enact):
     """All sizes, up to 100 MB."""
     rows = rows_of(enact("bench", "fetch", "publish", "--embedded", "--json", *SHORT))

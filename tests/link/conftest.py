@@ -225,6 +225,20 @@ def program():
 
 
 @pytest.fixture
+def lease(monkeypatch):
+    """Set the TTL of sessions that join at an endpoint: `lease(seconds)`, here and in programs.
+
+    A program takes it from `LEASE_S`; no variable of the product concerns an endpoint.
+    """
+
+    def set_for_all(seconds):
+        monkeypatch.setattr("enact_dist.world.connecting.TTL_S", seconds)
+        monkeypatch.setenv("LEASE_S", str(seconds))
+
+    return set_for_all
+
+
+@pytest.fixture
 def free():
     """Returns further endpoints of the loopback at which nobody listens yet."""
     return free_endpoint
@@ -282,6 +296,15 @@ def process(program):
         return started
 
     return start
+
+
+@pytest.fixture
+def memory(tmp_path):
+    """A folder in memory: what is killed, and not cut off its power, leaves the same there."""
+    from store_disk import memory_folder
+
+    with memory_folder(tmp_path) as made:
+        yield made
 
 
 @pytest.fixture

@@ -13,7 +13,9 @@ RETAINER = """
 import ctypes, os, signal, sys, threading
 from enact_dist import Aspect, Durability, Entity, Lock, Read, Write, connect
 from enact_dist.errors import EnactError
+from enact_dist.world import connecting
 
+connecting.TTL_S = float(os.environ.get("LEASE_S", connecting.TTL_S))
 signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGUSR1})
 cell = connect(sys.argv[1], actor="retainer")
 online, cup = cell.world("online"), Entity("cup")

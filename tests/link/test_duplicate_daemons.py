@@ -95,13 +95,15 @@ def test_later_daemon_is_refused_where_other_shards_expect_the_first_one(begin, 
     assert second in str(refused.value)
 
 
-def test_shard_is_refused_beside_another_one_that_runs_twice(begin, free):
+def test_shard_is_refused_beside_another_one_that_runs_twice(begin, free, monkeypatch):
     """Nobody listened at that time who could have told the second one."""
     first, second, right = free(), free(), free()
     begin("left", first, left=first, right=right)
     begin("left", second, left=second, right=right)
     third = free()
-    begin("third", third, left=second, right=right, third=third)
+    with monkeypatch.context() as brief:
+        brief.setattr("enact_dist.link.daemon.second_daemon.PROBE_S", 0.3)  # right never answers
+        begin("third", third, left=second, right=right, third=third)
 
     with pytest.raises(LinkError, match=r"2 daemons serve shard left") as refused:
         begin("right", right, left=first, right=right, third=third)

@@ -98,16 +98,16 @@ ACTS = (
 """What is done, in this order."""
 
 
-def test_killed_at_any_act_it_is_taken_up(tmp_path):
+def test_killed_at_any_act_it_is_taken_up(memory):
     """Each shard has all of it or nothing, and serves nobody until a run has come to its end."""
-    origin = StoppedCell(tmp_path / "origin", TWO)
+    origin = StoppedCell(memory / "origin", TWO)
     origin.fill(4, rounds=12)
     there = {name: of_aspect(folder) for name, folder in origin.folders.items()}
     rest = {name: rest_of(folder) for name, folder in origin.folders.items()}
     number, was_killed, halves = 0, True, 0
     while was_killed:
         number += 1
-        cell = StoppedCell(tmp_path / f"run{number}", TWO)
+        cell = StoppedCell(memory / f"run{number}", TWO)
         shutil.copytree(origin.folder, cell.folder)
         was_killed = killed_at(cell, number)
         found = {name: of_aspect(folder) for name, folder in cell.folders.items()}

@@ -19,6 +19,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from enact_dist import Aspect, Entities, Entity, Lock, View, ViewEach, Write, connect
 from enact_dist.core.protocol import messages as m
 from enact_dist.errors import ConfigError, EnactError, PermissionDeniedError
+from enact_dist.link.client import locks as link_client
 from enact_dist.link.host import ShardHost
 from enact_dist.link.zenoh.access import new_session_id, opens
 from enact_dist.link.zenoh.tls import KeyFiles, own_certificate, why_refused
@@ -142,8 +143,9 @@ def test_key_of_several_verbs_or_names_or_of_another_one_reaches_no_shard(
 
 
 @both
-def test_name_that_is_removed_loses_its_lock_at_the_reload(tmp_path, way):
+def test_name_that_is_removed_loses_its_lock_at_the_reload(tmp_path, way, monkeypatch):
     """The next one that waits for it has it; what the removed one writes is not there."""
+    monkeypatch.setattr(link_client, "FINISH_S", 1.0)  # its commit is never answered
     cell = key_cells.KeyCell(tmp_path, carrier=way)
     with (
         cell.running() as shard,

@@ -22,6 +22,8 @@ from enact_dist import Entity, Lock, connect
 
 pytestmark = [pytest.mark.carrier("socket", "zenoh"), pytest.mark.kept_grants]
 
+WAIT_S = 20.0
+
 KEEPS_AND_ADDS = """
 keep()
 tell("kept")
@@ -57,9 +59,15 @@ hear()
 
 
 @pytest.fixture
-def long_leases(monkeypatch):
-    """What a lease alone frees, it frees long after the test has failed."""
-    monkeypatch.setenv("ENACT_SESSION_TTL_S", "60")
+def long_leases(lease):
+    """What a lease alone frees, it frees after three times as long as the next one waits."""
+    lease(3 * WAIT_S)
+
+
+@pytest.fixture
+def short_leases(lease):
+    """What stands still loses its lease soon."""
+    lease(0.5)
 
 
 @pytest.fixture
@@ -84,7 +92,7 @@ def lock_of(cell, actor="retainer"):
 def taken(request):
     """Lock once; return how long that took, in milliseconds."""
     before_s = time.perf_counter()
-    with Lock(request, wait_s=60.0):
+    with Lock(request, wait_s=WAIT_S):
         return (time.perf_counter() - before_s) * 1e3
 
 
@@ -138,7 +146,7 @@ def test_grant_in_use_lasts_to_the_end_of_its_block_and_no_longer(
     """Who waits has it then, with what the block has written; the process goes on without it."""
     process = program(RETAINER, endpoint, text)
     heard(process, "in")
-    waiting = Waiting(slot(cell))
+    waiting = Waiting(slot(cell), wait_s=WAIT_S)
     until(lambda: waiters(cell))
     assert lock_of(cell).state == "recalled"
     assert not waiting.granted.is_set()
@@ -161,7 +169,7 @@ def test_killed_process_keeps_nobody_waiting(cell, endpoint, program, until, tex
     process = program(RETAINER, endpoint, text)
     process.stdout.readline()
     if text is USES:
-        waiting = Waiting(slot(cell))
+        waiting = Waiting(slot(cell), wait_s=WAIT_S)
         until(lambda: waiters(cell))
         before_s = time.perf_counter()
         process.kill()
@@ -177,10 +185,9 @@ def test_killed_process_keeps_nobody_waiting(cell, endpoint, program, until, tex
 
 @pytest.mark.slow
 def test_block_that_outlived_its_lease_shows_nothing_stale_as_good(
-    cell, endpoint, program, until, monkeypatch
+    short_leases, cell, endpoint, program
 ):
     """Stopped for longer than a TTL in a read-only block: it ends as lost, and the next is fresh."""
-    monkeypatch.setenv("ENACT_SESSION_TTL_S", "0.5")
     text = """
 keep(read)
 try:
@@ -210,10 +217,9 @@ hear()
 
 @pytest.mark.slow
 def test_grant_that_outlived_its_lease_is_asked_for_anew(
-    shard, cell, endpoint, program, until, monkeypatch
+    short_leases, shard, cell, endpoint, program, until
 ):
     """As above, stopped between two blocks; the session keeps grants again afterwards."""
-    monkeypatch.setenv("ENACT_SESSION_TTL_S", "0.5")
     text = """
 keep(read)
 tell("kept")
@@ -294,7 +300,7 @@ def test_child_forked_in_a_block_neither_frees_nor_holds_its_parents_grant(
     """The grant ends with the parent's block, or with the parent."""
     process = program(RETAINER, endpoint, FORKS_IN_USE)
     heard(process, "forked")
-    waiting = Waiting(slot(cell))
+    waiting = Waiting(slot(cell), wait_s=WAIT_S)
     until(lambda: waiters(cell))
     assert lock_of(cell).state == "recalled"
     assert not waiting.granted.is_set()
@@ -352,6 +358,7 @@ def test_waiters_behind_a_process_that_locks_in_a_loop_all_get_their_turn(
     assert order == waiting
 
 
+UPDATES = 60
 COUNTS = """
 for _ in range(int(sys.argv[3])):
     add_one()
@@ -360,14 +367,13 @@ tell(cell.statistics().get("grants_used_again", 0))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("retain", ["1", "0"], ids=["kept", "not-kept"])
-@pytest.mark.parametrize("count", [2, 4])
+@pytest.mark.parametrize(("count", "retain"), [(2, "1"), (4, "1"), (4, "0")])
 def test_processes_that_add_to_one_slot_lose_no_update(
     cell, endpoint, program, monkeypatch, count, retain
 ):
     """The value is the number of updates that were told as done."""
     monkeypatch.setenv("ENACT_RETAIN", retain)
-    processes = [program(RETAINER, endpoint, COUNTS, 150) for _ in range(count)]
+    processes = [program(RETAINER, endpoint, COUNTS, UPDATES) for _ in range(count)]
     again = []
     for process in processes:
         line = process.stdout.readline()
@@ -375,5 +381,5 @@ def test_processes_that_add_to_one_slot_lose_no_update(
         again.append(int(line))
 
     with Lock(slot(cell)) as lock:
-        assert lock[slot(cell)] == count * 150
+        assert lock[slot(cell)] == count * UPDATES
     assert retain != "0" or again == [0] * count

@@ -18,10 +18,9 @@ KEPT_EACH = 60
 
 
 def test_shard_killed_with_many_kept_grants_shows_nothing_stale_when_it_is_back(
-    process, endpoint, tmp_path, until, monkeypatch, record_property
+    process, endpoint, tmp_path, until, record_property
 ):
     """Nobody who missed the restart is believed, and all locks are free within one TTL."""
-    monkeypatch.setenv("ENACT_SESSION_TTL_S", "2")
     durable, many = Aspect("count", int), [Entity(f"thing/{number}") for number in range(KEPT_EACH)]
     killed = process(endpoint, tmp_path / "data", durability="os")
     with contextlib.ExitStack() as opened:

@@ -70,10 +70,10 @@ def bases(cell):
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_all_is_as_before_and_goes_on(tmp_path, seed):
+def test_all_is_as_before_and_goes_on(memory, seed):
     """Data, versions, history, labels, causes, forks and the past, to a new shard and back."""
-    cell = StoppedCell(tmp_path, TWO)
-    cell.fill(seed)
+    cell = StoppedCell(memory, TWO)
+    cell.fill(seed, rounds=15)
     probes_ns = cell.probes_ns()
     before, _ = cell.shown(probes_ns)
     with cell.opened() as cells:
@@ -161,10 +161,10 @@ def killed_at(cell, where, number):
     return os.WIFSIGNALED(os.waitpid(child, 0)[1])
 
 
-def test_killed_at_any_act_it_is_taken_up(tmp_path, monkeypatch):
+def test_killed_at_any_act_it_is_taken_up(memory, monkeypatch):
     """Killed at each act, and once more on the way: then all is where it belongs, once."""
-    monkeypatch.setattr(module, "BATCH_STATES", 12)
-    origin = StoppedCell(tmp_path / "origin", TWO)
+    monkeypatch.setattr(module, "BATCH_STATES", 36)
+    origin = StoppedCell(memory / "origin", TWO)
     origin.fill(4, rounds=12)
     slots, labels, _ = stored(origin)
     started = bases(origin)
@@ -173,7 +173,7 @@ def test_killed_at_any_act_it_is_taken_up(tmp_path, monkeypatch):
     number, was_killed = 0, True
     while was_killed:
         number += 1
-        cell = StoppedCell(tmp_path / f"run{number}", TWO)
+        cell = StoppedCell(memory / f"run{number}", TWO)
         shutil.copytree(origin.folder, cell.folder)
         was_killed = killed_at(cell, THREE, number)
         if was_killed:

@@ -33,6 +33,8 @@ def test_peer_of_another_user_is_refused_by_name():
 HOLDER = """
 import os, sys, threading
 from enact_dist import Aspect, Durability, Entity, Lock, Write, connect
+from enact_dist.world import connecting
+connecting.TTL_S = float(os.environ.get("LEASE_S", connecting.TTL_S))
 cell = connect(sys.argv[1], actor="holder")
 request = Write(cell.world("online"), Entity("cup"), Aspect("count", int, Durability.VOLATILE))
 with Lock(request) as lock:
@@ -70,9 +72,9 @@ for name in os.listdir("/proc/self/fd"):
 
 
 @pytest.fixture
-def long_leases(monkeypatch):
+def long_leases(lease):
     """What a lease alone frees, it frees after three times as long as the next one waits."""
-    monkeypatch.setenv("ENACT_SESSION_TTL_S", "180")
+    lease(60.0)
 
 
 def wait_while(endpoint, happens):
@@ -83,7 +85,7 @@ def wait_while(endpoint, happens):
         granted = []
 
         def wait():
-            with Lock(request, wait_s=60.0):
+            with Lock(request, wait_s=20.0):
                 granted.append(request)
 
         waiting = threading.Thread(target=wait)

@@ -88,13 +88,14 @@ def test_shard_that_goes_and_comes_at_once_is_told_whatever_event_is_the_last():
 def test_presence_may_be_asked_while_it_is_ended(endpoint):
     """From another thread: Zenoh's binding raises where one reads and another undeclares."""
     session = open_session(listen=[endpoint], lease_s=1.0)
-    presences, over, errors = [], threading.Event(), []
+    presences, asked, over, errors = [], threading.Event(), threading.Event(), []
 
     def ask():
         try:
             while not over.is_set():
                 for presence in presences[-1:]:
                     assert presence.here in {True, False}
+                    asked.set()
         except BaseException as error:
             errors.append(error)
             raise
@@ -103,8 +104,10 @@ def test_presence_may_be_asked_while_it_is_ended(endpoint):
     try:
         for thread in asking:
             thread.start()
-        for number in range(100):
+        for number in range(20):
             presences.append(ShardPresence(session, f"enact/cell/s{number}/hello/x", list))
+            asked.clear()
+            assert asked.wait(30)
             presences[-1].close(30.0)
     finally:
         over.set()
