@@ -27,7 +27,6 @@ from typing import Any, Final, TypeVar
 from enact_dist.config.rights import SecurityConfig
 from enact_dist.config.table import Field, fields_of, path_of, suggestion
 from enact_dist.config.types import (
-    CARRIER_DEFAULT,
     CellConfig,
     ShardConfig,
     is_locked,
@@ -36,6 +35,7 @@ from enact_dist.config.types import (
 from enact_dist.errors import ConfigError
 
 T = TypeVar("T", CellConfig, SecurityConfig, ShardConfig)
+V = TypeVar("V", float, str)
 
 
 def variables_of(kind: type) -> dict[str, Field]:
@@ -81,15 +81,17 @@ def without_overrides(environment: Mapping[str, str]) -> dict[str, str]:
     }
 
 
-def carrier_of(environment: Mapping[str, str]) -> str:
-    """Return the carrier that the environment asks for where no `cell.toml` does.
+def setting_of(environment: Mapping[str, str], key: str, default: V) -> V:
+    """Return what a variable says of a whole cell, for an endpoint without a `cell.toml`.
 
     Raises:
-        ConfigError: No shard has that name.
+        ConfigError: It says what no cell.toml may say.
     """
-    text = environment.get("ENACT_CARRIER") or CARRIER_DEFAULT
-    carrier: str = _read("ENACT_CARRIER", text, variables_of(CellConfig)["CARRIER"])
-    return carrier
+    text = environment.get(f"ENACT_{key}")
+    if not text:
+        return default
+    value: V = _read(f"ENACT_{key}", text, variables_of(CellConfig)[key])
+    return value
 
 
 def security_of(environment: Mapping[str, str], endpoint: str) -> SecurityConfig:

@@ -116,13 +116,15 @@ def _known_of(target: str | Path) -> _Known:
     Raises:
         ConfigError: It is neither, or cannot be used.
     """
-    from enact_dist.config.environment import carrier_of, security_of
+    from enact_dist.config.environment import security_of, setting_of
     from enact_dist.config.read import load_config
+    from enact_dist.config.types import CARRIER_DEFAULT
 
     if _is_endpoint(target):
         place = str(target)
-        security = security_of(os.environ, place)
-        return _Known("", TTL_S, carrier_of(os.environ), (place,), (), security)
+        ttl_s = setting_of(os.environ, "SESSION_TTL_S", TTL_S)
+        carrier = setting_of(os.environ, "CARRIER", CARRIER_DEFAULT)
+        return _Known("", ttl_s, carrier, (place,), (), security_of(os.environ, place))
     _refuse_no_file(target)
     config = load_config(Path(target))
     expected = config.placement_map().shards

@@ -4,11 +4,12 @@ from pathlib import Path
 
 import pytest
 
-from enact_dist.config.environment import carrier_of
+from enact_dist.config.environment import setting_of
 from enact_dist.config.read import load_config, parse_config
 from enact_dist.core.protocol.messages import AspectEntry, Pin, ShardEntry
 from enact_dist.errors import ConfigError
 from enact_dist.terms import Durability, Retention
+from enact_dist.world.connecting import _known_of
 
 FILE = Path("/cells/demo/cell.toml")
 
@@ -410,7 +411,19 @@ def test_empty_variables_count_as_none():
     nothing = {f"ENACT_{name}": "" for name in (*of_cell, *of_shard)}
 
     assert parsed(FULL, **nothing) == parsed(FULL)
-    assert carrier_of(nothing) == carrier_of({})
+    assert setting_of(nothing, "CARRIER", "auto") == "auto"
+    assert setting_of(nothing, "SESSION_TTL_S", 2.0) == 2.0
+
+
+def test_an_endpoint_takes_what_the_environment_says_of_a_cell(monkeypatch, tmp_path):
+    """As for a file: an endpoint alone says neither how long a session lives nor the carrier."""
+    monkeypatch.setenv("ENACT_SESSION_TTL_S", "7.5")
+    monkeypatch.setenv("ENACT_CARRIER", "zenoh")
+    known = _known_of("tcp/127.0.0.1:7447")
+    assert (known.ttl_s, known.carrier) == (7.5, "zenoh")
+    monkeypatch.setenv("ENACT_SESSION_TTL_S", "0.1")
+    with pytest.raises(ConfigError, match=r"no number of seconds from 0\.2 to 60"):
+        _known_of("tcp/127.0.0.1:7447")
 
 
 WRONG_ENVIRONMENT = [
