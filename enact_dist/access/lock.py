@@ -17,13 +17,7 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar, overload
 
 from enact_dist.access.arguments import HOLD_S_MAX, check_hold, check_seconds
 from enact_dist.access.each import Block, WritableEach
-from enact_dist.access.reads import (
-    EachData,
-    Readings,
-    check_requested,
-    misfit,
-    slot_of,
-)
+from enact_dist.access.reads import EachData, Readings, check_requested, misfit, slot_of
 from enact_dist.access.session import bind, bound_before
 from enact_dist.access.together import Together
 from enact_dist.access.trigger import LockStatistics, Triggered
@@ -47,6 +41,7 @@ if TYPE_CHECKING:
     from enact_dist.access.session import Session
     from enact_dist.access.writes import DTypesLike, ShapesLike
     from enact_dist.core.client.lock import MultiLock
+    from enact_dist.core.client.plan import Reading
     from enact_dist.core.protocol.datum import Position, Slot
     from enact_dist.core.protocol.messages import DatumRead, Item
     from enact_dist.terms import (
@@ -130,6 +125,7 @@ class Lock(Triggered):
         self._asking = self._over = False
         self._interrupt: threading.Event | None = None
         self._after: tuple[DatumRead, ...] = ()
+        self._shown: tuple[Reading, ...] = ()
         self._readings: Readings
         self._each: dict[LockRequest[Any], EachData[Any]] = {}
         self._writing = Writing(self._session.client.payloads)
@@ -166,6 +162,7 @@ class Lock(Triggered):
                 keep=() if self._after else self._bound.items,
                 after=self._after,
             )
+            lock.states += self._shown
             if session.unknown or client.catalogue.lapses != prepared:
                 session.check_shown(lock.states, self._requests, prepared)
             self._granted_s = time.monotonic()

@@ -5,6 +5,9 @@ skipped, a number that a keep-alive knows and no notice brought, or a new epoch 
 were missed: the watch then lists the slots again and yields one change per slot that moved, whose
 `gap` says how many versions were skipped.
 
+Where a watch asks for data, a notice over a socket brings those that are small, and the names of
+those in shared memory.  A watch that is behind gets bare notices, so they take no memory.
+
 A shard that is added to the cell is listed as soon as this client knows of it.  Entities may have
 moved to it: a state that moved unchanged is no change.
 
@@ -20,10 +23,11 @@ import time
 import weakref
 from abc import ABC, abstractmethod
 from collections import deque
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Self, TypeVar
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, Self, TypeVar
 
 from enact_dist.access.arguments import check_seconds
+from enact_dist.core.client.plan import Reading
 from enact_dist.core.protocol.datum import Position, Slot
 from enact_dist.core.protocol.messages import Notice, Ping, SlotState, Survey, Surveyed
 from enact_dist.core.state.clock import STAMP_NS_MAX, is_kept, is_older
@@ -32,8 +36,10 @@ from enact_dist.link.notices import Interest, Skipped
 from enact_dist.terms import Durability, Entities, Entity
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from types import TracebackType
 
+    from enact_dist.core.protocol.datum import Datum
     from enact_dist.link.client.locks import CellClient
 
 POLL_S: Final = 0.1
@@ -113,6 +119,7 @@ class Change:
         null: Whether the slot is null now.
         captured_ns: When the datum was captured, according to its writer (0: unknown, or null).
         world: Name of the world context.
+        carried: The datum, encoded, if it came with the notice; see `Watch.value`.
     """
 
     entity: Entity
@@ -123,6 +130,7 @@ class Change:
     null: bool
     captured_ns: int = 0
     world: str = ""
+    carried: Reading | None = field(default=None, repr=False, compare=False)
 
 
 @dataclass(slots=True)
@@ -157,10 +165,11 @@ class Watch(Following[Change]):
         aspects: tuple[str, ...],
         *,
         lenient: bool = False,
+        read: Callable[[Change], Any] | None = None,
     ) -> None:
-        self._client, self._lenient = client, lenient
+        self._client, self._lenient, self._read = client, lenient, read
         named = tuple(str(Entities(pattern)) for pattern in patterns)
-        self._survey = Survey(contexts, named, aspects)
+        self._survey = Survey(contexts, named, aspects, data=read is not None)
         self._interest = Interest(self._survey)
         self._known: dict[Slot, _Known] = {}
         self._following: dict[str, _Following] = {}
@@ -228,6 +237,23 @@ class Watch(Following[Change]):
                 return None
         return None
 
+    def value(self, change: Change) -> Any:
+        """Return the datum of a change, None if it is null.
+
+        It is that of this version if its notice brought it, else the newest one, by a view.
+
+        Raises:
+            MisuseError: The watch was made without ``data=True``.
+        """
+        if self._read is None:
+            raise MisuseError("this watch tells only of changes; make it with data=True")
+        return None if change.null else self._read(change)
+
+    @property
+    def within_notice(self) -> bool:
+        """Whether further changes came with the last one, of the same commit if it was one."""
+        return bool(self._pending)
+
     def next_here(self) -> Change | None:
         """Return the next change of those that came with an earlier one, or None."""
         while not self._pending:
@@ -258,10 +284,10 @@ class Watch(Following[Change]):
             self._try_list_again(notice.shard)
             return
         following.number = notice.number
-        for slot, version, stamp_ns, null, captured_ns in notice.changes:
+        for slot, version, stamp_ns, null, captured_ns, datum in notice.changes:
             if self._interest.wants(slot) and not self._is_past(slot, version, stamp_ns):
                 known = _Known(notice.epoch, (version, stamp_ns))
-                self._note(notice.shard, slot, known, null=null, captured=captured_ns)
+                self._note(notice.shard, slot, known, null, captured_ns, datum)
 
     def _is_past(self, slot: Slot, version: int, stamp_ns: int) -> bool:
         """Whether a later state is known: a long listing ends after the notice it begins with."""
@@ -333,7 +359,7 @@ class Watch(Following[Change]):
                 if not self._following[shard].listed:
                     self._known[state.slot] = known._replace(told=False)
                 continue
-            self._note(shard, state.slot, known, null=null, captured=state.captured_ns)
+            self._note(shard, state.slot, known, null, state.captured_ns)
         self._note_vanished(shard, answer.epoch, {state.slot for state in states})
         self._feed.not_beyond(shard, answer.epoch, answer.notice_number)
         self._following[shard] = _Following(answer.epoch, answer.notice_number, listed=True)
@@ -365,7 +391,13 @@ class Watch(Following[Change]):
         ]
 
     def _note(
-        self, shard: str, slot: Slot, state: _Known, *, null: bool, captured: int = 0
+        self,
+        shard: str,
+        slot: Slot,
+        state: _Known,
+        null: bool,
+        captured_ns: int = 0,
+        datum: Datum | None = None,
     ) -> None:
         """Add a change unless it is known.
 
@@ -387,10 +419,24 @@ class Watch(Following[Change]):
             gap = version - last - 1 if version > last else version - 1
         gap = max(0, gap)
         self._missed += gap
-        position = Position(stamp_ns, shard)
+        position, carried = Position(stamp_ns, shard), None
+        if datum is not None:
+            named, size = bool(datum.file), datum.size
+            shown = SlotState(slot, version, stamp_ns, size, datum, False, named, "", captured_ns)
+            carried = Reading(shard, state.epoch, shown)
         entity = Entity(slot.entity)
         self._pending.append(
-            Change(entity, slot.aspect, version, position, gap, null, captured, slot.context)
+            Change(
+                entity,
+                slot.aspect,
+                version,
+                position,
+                gap,
+                null,
+                captured_ns,
+                slot.context,
+                carried,
+            )
         )
 
     def _goes_on(self, shard: str, slot: Slot, epoch: int) -> bool:

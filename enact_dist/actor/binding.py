@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     import threading
     from collections.abc import Mapping
 
+    from enact_dist.core.client.plan import Reading
     from enact_dist.core.protocol.datum import Slot
     from enact_dist.core.protocol.messages import DatumRead
     from enact_dist.world.cell import Cell
@@ -135,6 +136,7 @@ class BoundActor:
         members: tuple[int, ...] = (),
         tick_ns: int = 0,
         after: tuple[DatumRead, ...] = (),
+        shown: tuple[Reading, ...] = (),
     ) -> ActorLock:
         """Return the lock of one update, not yet taken.
 
@@ -146,6 +148,7 @@ class BoundActor:
             members: Capture stamps of the set that triggered it, as `Trigger`; nothing without one.
             tick_ns: The tick of a source that it is for; 0 of anything else.
             after: What the actor has seen, for a lock that waits for news; see `trigger_slots`.
+            shown: All data of the set, if notices have brought them and nothing else is asked for.
         """
         entity = entity or self.only
         return ActorLock(
@@ -159,7 +162,19 @@ class BoundActor:
             tick_ns=tick_ns,
             triggers=self.declaration.triggers,
             after=after,
+            shown=shown,
         )
+
+    @property
+    def views_one_set(self) -> bool:
+        """Whether it asks only for a set, whose data are of one world context and on one shard.
+
+        Then the notices of one watch, noted whole and in order, show the set as one cut.
+        """
+        views = self.set_views()
+        if not views or len(views) < len(self.declaration.requests) or len(self.contexts) > 1:
+            return False
+        return len(session_of(views).shards_of(views)) == 1
 
     def trigger_slots(self) -> tuple[Slot, ...]:
         """Return the slot of each trigger if a lock can wait at its shard for their news; else ().

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, Generic, Self, TypeVar
 
 from enact_dist.access.session import session_of
 from enact_dist.access.sets import Capture, IncompleteSet, PendingSets
-from enact_dist.access.together import captured_versions
+from enact_dist.access.together import OPEN_LIMIT, captured_versions
 from enact_dist.actor.report import ERROR_LENGTH_MAX, Repeated
 from enact_dist.actor.triggers import BackOff, PendingTriggers
 from enact_dist.core.protocol.messages import DatumRead
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from enact_dist.access.trigger import Trigger
     from enact_dist.access.watch import Change, Watch
     from enact_dist.actor.binding import BoundActor, Watched
+    from enact_dist.core.client.plan import Reading
     from enact_dist.core.protocol.datum import Slot
 
 log = logging.getLogger("enact.actor")
@@ -159,6 +160,7 @@ class SetInbox(_Box[PendingSets]):
     def __init__(self, sets: PendingSets, views: tuple[View[Any], ...] = ()) -> None:
         super().__init__(sets)
         self._views = views
+        self._carried: list[dict[int, Reading]] = [{} for _ in views]
         self._repeated = Repeated()
 
     @property
@@ -182,10 +184,28 @@ class SetInbox(_Box[PendingSets]):
         versions = [Capture(change.version, stamp_ns, change.captured_ns, change.null)]
         with self._filled:
             misses = self._pending.misses(index, change.version)
+            carried = self._carried[index]
+            carried.pop(change.captured_ns, None)
+            if change.carried is not None:
+                carried[change.captured_ns] = change.carried
+                if len(carried) > OPEN_LIMIT:
+                    del carried[next(iter(carried))]
         if misses:
             view = self._views[index]
             (versions,) = captured_versions(session_of((view,)), (view,))
         self.captured(index, versions)
+
+    def shown(self, members: Sequence[int]) -> tuple[Reading, ...]:
+        """Return the data of a set as notices of one shard have brought them; () if one is missing.
+
+        They are one cut: its notices are noted whole, in order, and without a gap.
+        """
+        with self._filled:
+            each = zip(self._carried, members, strict=True)
+            found = [carried.get(stamp_ns) for carried, stamp_ns in each]
+        shown = tuple(one for one in found if one is not None)
+        one_shard = len({(one.shard, one.epoch) for one in shown}) == 1
+        return shown if one_shard and len(shown) == len(members) else ()
 
     def captured(self, member: int, versions: Sequence[Capture]) -> None:
         """Take versions of one member of the set, oldest first."""
@@ -280,15 +300,12 @@ class _Follower:
                     self._over.wait(min(left_s, wait_s))
                     return
                 watch = self._watch = self._opened()
-            change = watch.next(timeout_s=wait_s)
-            for _ in range(AT_ONCE_MAX):
-                if change is None:
-                    return
+            change, noted = watch.next(timeout_s=wait_s), 0
+            while change is not None:
                 self._refused = 0
                 self._note(change)
-                change = watch.next_here()
-            if change is not None:
-                self._note(change)
+                noted += 1
+                change = watch.next_here() if noted < AT_ONCE_MAX or watch.within_notice else None
         except LinkError as error:
             self.close()
             pause_s = BackOff().wait_s(self._refused, random.random())  # noqa: S311 (spreads retries)
@@ -309,7 +326,8 @@ class _Follower:
     def _opened(self) -> Watch:
         patterns = dict.fromkeys(str(watched.entities) for watched in self._watched)
         aspects = {aspect.name: aspect for watched in self._watched for aspect in watched.aspects}
-        return self._watched[0].context.watch_all(patterns, aspects.values())
+        data = self._bound.views_one_set
+        return self._watched[0].context.watch_all(patterns, aspects.values(), data=data)
 
     def _note(self, change: Change) -> None:
         if not self._bound.covers(change.entity):

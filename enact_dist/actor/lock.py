@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from enact_dist.access.trigger import Newer
     from enact_dist.actor.outcome import Outcome
+    from enact_dist.core.client.plan import Reading
     from enact_dist.core.protocol.messages import DatumRead, Item
 
 
@@ -46,6 +47,7 @@ class ActorLock(Lock):
         tick_ns: The tick of `every_s` that it is for, 0 if it is for none.
         triggers: The declared requests that trigger the actor.
         after: What the actor has seen: the lock waits until one of these slots shows a newer datum.
+        shown: All that it views, as notices have shown it, so that it needs no call.
     """
 
     def __init__(
@@ -61,9 +63,13 @@ class ActorLock(Lock):
         tick_ns: int = 0,
         triggers: Sequence[LockRequest[Any]] = (),
         after: tuple[DatumRead, ...] = (),
+        shown: tuple[Reading, ...] = (),
     ) -> None:
         super().__init__(*bound.values(), wait_s=wait_s, hold_s=hold_s)
         self._after = after
+        # While this refers to the maps of large data, they can be looked at without a call.
+        self._maps = self._mapped(shown) if shown else ()
+        self._shown = shown if self._maps is not None else ()
         self._interrupt = stop
         self._entity = entity
         self._declared = bound
@@ -80,7 +86,24 @@ class ActorLock(Lock):
             self._asked_s = self._granted_s - self._lock.waited_ns / 1e9
         return self
 
+    def _mapped(self, shown: Sequence[Reading]) -> tuple[memoryview, ...] | None:
+        """Return maps of those of the data that are only named; None if one is gone."""
+        maps, payloads = list[memoryview](), self._session.client.payloads
+        for shard, epoch, state in shown:
+            if state.large and state.datum is not None:
+                body = payloads.mapped(shard, epoch, state.datum.file, state.size)
+                if body is None:
+                    return None
+                maps.append(body)
+        return tuple(maps)
+
+    def _let_go(self) -> None:
+        self._maps = ()
+        super()._let_go()
+
     def _items(self) -> tuple[Item, ...]:
+        if self._shown:
+            return ()
         if not self._in_set:
             return super()._items()
         of, stamps = self._session.item_of, self._in_set

@@ -24,6 +24,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from functools import partial
 from threading import get_ident
 from typing import TYPE_CHECKING, Final, cast
 
@@ -51,6 +52,7 @@ from enact_dist.core.protocol.records import (
     Tick,
 )
 from enact_dist.core.shard import owners
+from enact_dist.core.shard.inspection import with_data
 from enact_dist.core.shard.shard import Shard
 from enact_dist.core.state.clock import state_of
 from enact_dist.errors import StoreError
@@ -94,11 +96,9 @@ class ShardHost:
         shard: The shard; only the host calls it from now on.
         store: Where its records go; None: they last only as long as this process.
         clock: Read under the mutex, so the shard's time never goes back.
-        on_failure: Called once, from any thread, when the store or the core has failed; the host is
-            dead then and answers no request.
+        on_failure: Called once, from any thread, when the store or the core has failed.
         shared: Folder of large data that clients of this host map; None: they stay in memory.
-        payload_bytes_max: Byte limit of that folder; None: half of the file system, and plain
-            memory beyond.
+        payload_bytes_max: Byte limit of that folder; None: half of the file system.
     """
 
     def __init__(
@@ -112,6 +112,7 @@ class ShardHost:
         payload_bytes_max: int | None = None,
     ) -> None:
         self._shard = shard
+        self.with_data = partial(with_data, shard.state.slots)  # of a notice, while it is published
         mark_uses(shard.state.tenures.kept, shared)
         self._clock: Clock = clock or SystemClock()
         self._on_failure = on_failure
@@ -133,8 +134,7 @@ class ShardHost:
         self._inboxes: dict[Callable[[], None], Callable[[], object]] = {}  # and what removes it
         self._each_tick: tuple[Callable[[], None], ...] = ()
         self._failure: Exception | None = None
-        self._ended = False
-        self._draining = self._stops_now = self._lent = self._queued = False
+        self._ended = self._draining = self._stops_now = self._lent = self._queued = False
         self._rests = threading.Event()
         self._wake = threading.Condition(threading.Lock())
         self._look_again = False

@@ -15,6 +15,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Final, NamedTuple, Protocol
 
 from enact_dist.core.protocol.datum import Slot
@@ -26,6 +27,8 @@ NOTICES_MAX: Final = 65_536
 """Notices queued for a slow watcher: 11 minutes at 100 per second."""
 
 
+DATA_MAX: Final = 256
+"""Notices that wait with their data; a slow watcher reads those of further ones."""
 KNOWN_MAX: Final = 4096
 """Slots whose relevance is cached."""
 
@@ -37,6 +40,14 @@ class Skipped(NamedTuple):
     epoch: int
     after: int
     number: int
+
+
+def without_data(notice: Notice) -> Notice:
+    """Return a notice that only tells of its changes."""
+    if all(change.datum is None for change in notice.changes):
+        return notice
+    changes = [change._replace(datum=None) for change in notice.changes]
+    return replace(notice, changes=tuple(changes))
 
 
 class Interest:
@@ -169,6 +180,8 @@ class NoticeQueue:
         if len(self._notices) >= self._notices_max:
             self._notices.popleft()
             self._dropped += 1
+        if len(self._notices) >= DATA_MAX:
+            notice = without_data(notice)
         self._notices.append(notice)
         self._wake()
 

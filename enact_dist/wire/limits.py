@@ -11,7 +11,7 @@ from typing import Final
 
 from enact_dist.terms import NAME_LENGTH_MAX
 
-FRAME_VERSION: Final = 10
+FRAME_VERSION: Final = 11
 """Version of the frames; both ends must speak the same.  2: commits over shards; 3: a WELCOME
 names shared memory; 5: a datum may name a payload in place of its bytes; 7: an identity stands in
 the key of each request and token, and where a socket is opened; an aspect names the types that its
@@ -19,7 +19,7 @@ own has succeeded; listings come in pages; whether a shard is there is asked by 
 names the start of its daemon; a
 request that waits for a stamp names its session; 8: a session may keep a grant, whose token a later
 commit names; 9: a lock may wait for news before it enters the queue; 10: a payload may ask for
-files of the next ones."""
+files of the next ones; 11: a notice may carry data."""
 DATUM_VERSION: Final = 1
 """Version of the encoding of data; these are stored, so old versions stay readable."""
 

@@ -14,6 +14,7 @@ A history carries no data: `Version.datum` fetches one.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar, overload
 
 from enact_dist.access.arguments import (
@@ -28,13 +29,14 @@ from enact_dist.access.arguments import (
 from enact_dist.access.asking import listed
 from enact_dist.access.lock import Lock, refuse_inside_lock
 from enact_dist.access.reads import null_error
-from enact_dist.access.snapshot import Snapshot, reason_of, take_snapshot
-from enact_dist.access.watch import Watch
+from enact_dist.access.snapshot import Snapshot, reason_of, take_snapshot, untyped_datum
+from enact_dist.access.watch import Change, Watch
 from enact_dist.core.protocol.datum import Position, Slot
-from enact_dist.errors import ForgottenError, MisuseError
+from enact_dist.errors import ForgottenError, MisuseError, NullDatumError
+from enact_dist.link.client.fetch import at_hand
 from enact_dist.link.refusals import moment_name
 from enact_dist.terms import Aspect, Entities, Entity, FormerNames, LockRequest, View, Write
-from enact_dist.wire.payload import decode_untyped
+from enact_dist.wire.payload import decode_datum, decode_untyped
 from enact_dist.world.forks import fork_world
 from enact_dist.world.past import CellContext, PastContext
 
@@ -98,12 +100,15 @@ class WorldContext(CellContext):
         refuse_inside_lock("view")
         return take_snapshot(requests)
 
-    def watch(self, entities: Entities | Entity | str, *aspects: Aspect[Any]) -> Watch:
+    def watch(
+        self, entities: Entities | Entity | str, *aspects: Aspect[Any], data: bool = False
+    ) -> Watch:
         """Follow matching slots: first their present data, then every change in order.
 
         Args:
             entities: A pattern or one entity.
             aspects: Which aspects; none means all.
+            data: Whether notices bring the data, for `Watch.value`: up to 4 kB, or shared memory.
 
         Raises:
             LockHeldError: This thread holds a lock.
@@ -112,16 +117,38 @@ class WorldContext(CellContext):
         refuse_inside_lock("watch")
         check_pattern("watch(entities, *aspects)", "entities", entities)
         checked_each("watch(entities, *aspects)", "aspects", aspects, Aspect)
-        return self.watch_all((str(entities),), aspects)
+        return self.watch_all((str(entities),), aspects, data=data)
 
-    def watch_all(self, patterns: Iterable[str], aspects: Iterable[Aspect[Any]]) -> Watch:
+    def watch_all(
+        self, patterns: Iterable[str], aspects: Iterable[Aspect[Any]], *, data: bool = False
+    ) -> Watch:
         """Follow several patterns with one watch; as `watch`, for the framework."""
         self.session.client.check_usable()
         aspects = tuple(aspects)
         if aspects:
             self.session.look_up(aspects)
         names = tuple(aspect.name for aspect in aspects)
-        return Watch(self.session.client, (self.name,), tuple(patterns), names)
+        known = {aspect.name: aspect for aspect in aspects}
+        read = partial(self._value_of, known) if data else None
+        return Watch(self.session.client, (self.name,), tuple(patterns), names, read=read)
+
+    def _value_of(self, aspects: Mapping[str, Aspect[Any]], change: Change) -> Any:
+        """Return the datum that a change brought, or else the newest; see `Watch.value`."""
+        refuse_inside_lock("value")
+        aspect, session = aspects.get(change.aspect), self.session
+        if change.carried is not None:
+            datum = at_hand(session.client, session.cache, change.carried)
+            if datum is not None and aspect is not None:
+                return decode_datum(datum, aspect.datum_type)
+            if datum is not None:
+                return decode_untyped(datum)
+        try:
+            if aspect is None:
+                return untyped_datum(self, session, change.entity, change.aspect)
+            request = View(self, change.entity, aspect)
+            return self.view(request)[request]
+        except NullDatumError:  # deleted meanwhile
+            return None
 
     def watch_diff(
         self,

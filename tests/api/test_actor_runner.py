@@ -266,12 +266,12 @@ class FlakyContext:
         self.context = context
         self.failures = failures
 
-    def watch_all(self, *args):
+    def watch_all(self, *args, **options):
         """Watch, or fail as long as failures are left."""
         if self.failures:
             self.failures -= 1
             raise ShardUnreachableError("shard left did not answer")
-        return self.context.watch_all(*args)
+        return self.context.watch_all(*args, **options)
 
 
 @pytest.mark.parametrize("own", [False, True])

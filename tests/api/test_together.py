@@ -34,6 +34,7 @@ from enact_dist import (
     Write,
     testing,
 )
+from enact_dist.access.reads import slot_of
 from enact_dist.access.together import captured_versions
 from enact_dist.access.watch import Change
 from enact_dist.actor.actor import Actor
@@ -42,8 +43,11 @@ from enact_dist.actor.check import check_cell
 from enact_dist.actor.inbox import SetInbox
 from enact_dist.actor.running.process import ActorThread
 from enact_dist.config.read import load_config
-from enact_dist.core.protocol.datum import Position
+from enact_dist.core.client.plan import Reading
+from enact_dist.core.protocol.datum import Datum, Position
+from enact_dist.core.protocol.messages import SlotState
 from enact_dist.errors import MisuseError, NotRequestedError, NullDatumError
+from enact_dist.link.client.locks import CellClient
 
 pytestmark = pytest.mark.carrier("local", "drawn")
 
@@ -309,6 +313,98 @@ def test_versions_whose_notices_were_lost_are_asked_for(cell):
     runs = [inbox.take(0.0) for _ in range(4)]
     assert [run and run.captured_ns for run in runs] == [1, 2, 3, None]
     assert inbox.sets.incomplete == 0
+
+
+@pytest.mark.parametrize("size", [8, 300_000])
+def test_a_set_of_views_alone_needs_no_call(tmp_path, monkeypatch, size):
+    """The notices have brought it: small data whole, large ones by name; if one is gone, it asks."""
+    cloud = Aspect("cloud", np.ndarray, Durability.VOLATILE, retention=3)
+    asked, acquire = [], CellClient.acquire
+
+    def noted(client, items, **options):
+        items = tuple(items)
+        asked.extend([items] if any(item.captured_ns for item in items) else [])
+        return acquire(client, items, **options)
+
+    class Look(Sum):
+        depths = Together([View(role, entity, cloud) for entity in (LEFT, RIGHT)])
+        triggers = (depths,)
+        total = None
+
+        def update(self, lock):
+            assert self.gate.acquire(timeout=PATIENCE_S)
+            with self.moved:
+                shown = [int(one[-1]) for one in lock[self.depths]]
+                self.seen.append((lock.stamp_ns(self.depths), lock.valid(), shown))
+                self.moved.notify_all()
+            lock.check()
+
+    actor = Look()
+    with cameras("one shard", tmp_path, monkeypatch) as cell:
+        for entity in (LEFT, RIGHT):
+            capture(cell, entity, 1, np.full(size, 1, np.uint8), cloud)
+        with ActorThread(actor, cell) as thread:
+            actor.wait_until_seen(1)
+            monkeypatch.setattr(CellClient, "acquire", noted)
+            for stamp_ns in (2, 3, 4):
+                for entity in (LEFT, RIGHT):
+                    capture(cell, entity, stamp_ns, np.full(size, stamp_ns, np.uint8), cloud)
+                actor.wait_until_seen(stamp_ns)
+        assert thread.statistics().failures == 0
+    assert actor.seen == [(ns, True, [ns, ns]) for ns in (1, 2, 3, 4)]
+    assert asked == []
+
+
+def test_a_set_is_asked_for_where_a_payload_is_gone(cell):
+    """What a notice has named lasts no longer than its version does."""
+
+    class Look(Actor):
+        depths = pair(role)
+        triggers = (depths,)
+
+        def update(self, lock): ...
+
+    bound = BoundActor(Look(), cell)
+    capture(cell, LEFT, 5)
+    capture(cell, RIGHT, 5)
+    named = Datum(b"t", b"", 1 << 20, 5, "gone-1")
+    shown = tuple(
+        Reading("s0", 1, SlotState(slot_of(view), 1, 5, 1 << 20, named, False, True, "", 5))
+        for view in bound.set_views()
+    )
+    with bound.lock(None, members=(5, 5), shown=shown) as lock:
+        assert lock[Look.depths] == (5, 5)
+
+
+def test_set_whose_data_are_written_again_is_asked_for_where_a_notice_lacks_one(cell):
+    """What a listing brought may be older than what a notice brings: that is no cut."""
+    bound = BoundActor(Sum(), cell)
+    inbox = SetInbox(bound.pending_sets(), bound.set_views())
+    readings = [
+        Reading(
+            shard, 1, SlotState(slot_of(view), 2, 5, 0, Datum(b"t", b"", 0), False, False, "", 7)
+        )
+        for shard, view in zip(("s0", "s0"), bound.set_views(), strict=True)
+    ]
+
+    def note(index, version, carried):
+        position, entity = Position(version, "s0"), (LEFT, RIGHT)[index]
+        inbox.note(
+            index, Change(entity, "depth", version, position, 0, False, 7, "online", carried)
+        )
+
+    note(0, 1, readings[0])
+    assert inbox.shown((7, 7)) == ()
+    note(1, 2, readings[1])
+    assert inbox.shown((7, 7)) == tuple(readings)
+    note(1, 3, readings[1]._replace(epoch=2))
+    assert inbox.shown((7, 7)) == ()
+    note(1, 4, readings[1]._replace(shard="s1"))
+    assert inbox.shown((7, 7)) == ()
+    note(1, 5, readings[1])
+    assert inbox.shown((7, 7)) == tuple(readings)
+    note(0, 6, None)
+    assert inbox.shown((7, 7)) == ()
 
 
 def test_set_of_large_data_is_fetched_at_once(cell, monkeypatch):

@@ -1,8 +1,11 @@
 """What a user of `watch` may rely on: a snapshot, then every change, nothing missed unknowingly."""
 
 import threading
+from dataclasses import replace
 
+import numpy as np
 import pytest
+from polling import until
 
 from enact_dist import Aspect, Entities, Entity, Lock, Write
 from enact_dist.core.protocol import pages
@@ -13,6 +16,7 @@ from enact_dist.link import notices
 pytestmark = pytest.mark.carrier("local", "socket", "zenoh")
 
 COUNT, NAME = Aspect("count", int), Aspect("name", str)
+IMAGE = Aspect("image", np.ndarray)
 bench, piece = Entity("work_bench"), Entity("work_piece")
 SOON_S = 30.0
 
@@ -61,6 +65,53 @@ def test_watch_of_one_entity_takes_all_its_aspects(online):
         online.init(bench, COUNT, 1)
         online.init(bench, NAME, "x")
         assert [watch.next(SOON_S).aspect for _ in range(2)] == ["count", "name"]
+
+
+def test_watch_with_data_shows_the_datum_of_each_change(online, carrier):
+    """As its notice brought it; over Zenoh, where anyone may listen, by a view."""
+    online.init(bench, COUNT, 1)
+    count = Write(online, bench, COUNT)
+    with online.watch("**", COUNT, data=True) as watch:
+        first = watch.next(SOON_S)
+        write(count, 2)
+        write(count, 3)
+        second, third = watch.next(SOON_S), watch.next(SOON_S)
+        with Lock(count) as lock:
+            del lock[count]
+        fourth = watch.next(SOON_S)
+        by_view = None
+        shown = [watch.value(change) for change in (first, second, third, fourth)]
+    over_zenoh = carrier == "zenoh"
+    assert shown == [by_view, *([by_view] * 2 if over_zenoh else [2, 3]), None]
+    assert fourth.null
+
+
+def test_watch_of_all_aspects_shows_data_without_their_types(online):
+    """As `get_untyped` would."""
+    with online.watch(bench, data=True) as watch:
+        online.init(bench, NAME, "x")
+        change = watch.next(SOON_S)
+        assert watch.value(change) == "x"
+        with Lock(Write(online, bench, NAME)) as lock:
+            del lock[Write(online, bench, NAME)]
+        assert watch.value(replace(change, carried=None)) is None
+    with online.watch(bench) as watch, pytest.raises(MisuseError, match="data=True"):
+        watch.value(watch.next(SOON_S))
+
+
+@pytest.mark.parametrize("gone", [False, True])
+def test_watch_with_data_shows_large_arrays(online, gone):
+    """Mapped by their names where there is shared memory; else, and where they are gone, viewed."""
+    write_image = Write(online, bench, IMAGE)
+    with online.watch("**", IMAGE, data=True) as watch:
+        write(write_image, np.full(300_000, 1, np.uint8))
+        change = watch.next(SOON_S)
+        if gone:
+            write(write_image, np.full(300_000, 2, np.uint8))
+            until(lambda: watch.next(0) is not None)
+        shown = watch.value(change)
+    assert shown.shape == (300_000,)
+    assert set(shown) <= ({1, 2} if gone else {1})
 
 
 def test_change_tells_the_position_of_its_commit(cell, online):

@@ -33,19 +33,19 @@ role = World("online")
 
 @contextlib.contextmanager
 def cameras(kind, tmp_path, monkeypatch):
-    """Open a cell of one kind: "local", or "two shards", one for each camera."""
+    """Open a cell of one kind: "local", "one shard" or "two shards", one for each camera."""
     if kind == "local":
         with local(worlds=["online"]) as opened:
             yield opened
         return
     monkeypatch.setenv("ENACT_SHARED_FOLDER", str(tmp_path))
     monkeypatch.setenv("ENACT_CARRIER", "socket")
-    endpoints = [free_endpoint(), free_endpoint()]
-    names = ("s0", "s1")
+    names = ("s0", "s1") if kind == "two shards" else ("s0",)
+    endpoints = [free_endpoint() for _ in names]
     placement = PlacementMap(
         1,
         tuple(ShardEntry(name, (at,)) for name, at in zip(names, endpoints, strict=True)),
-        (Pin(str(LEFT), "s0"), Pin(str(RIGHT), "s1")),
+        (Pin(str(LEFT), "s0"), Pin(str(RIGHT), names[-1])),
     )
     shards = [
         start_shard(

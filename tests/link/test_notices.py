@@ -8,9 +8,9 @@ import threading
 import pytest
 from polling import until
 
-from enact_dist.core.protocol.datum import Slot
-from enact_dist.core.protocol.messages import Notice, Survey
-from enact_dist.link.notices import Interest, NoticeQueue, Skipped
+from enact_dist.core.protocol.datum import Datum, Slot
+from enact_dist.core.protocol.messages import Notice, SlotChange, Survey
+from enact_dist.link.notices import DATA_MAX, Interest, NoticeQueue, Skipped
 from enact_dist.link.socket.frames import prefixed
 from enact_dist.link.socket.line import Connection
 from enact_dist.wire.frames import encode_frame
@@ -100,12 +100,24 @@ def test_queue_with_an_interest_passes_on_only_the_numbers_of_the_rest():
     queue = NoticeQueue(Survey(("online",), ("cup/*",), ("count",)))
 
     for number, entity in ((1, "cup/1"), (2, "tray"), (3, "tray"), (6, "tray"), (7, "cup/2")):
-        change = (Slot("online", entity, "count"), number, number, False, 0)
+        change = SlotChange(Slot("online", entity, "count"), number, number, False)
         queue.put(Notice("s0", 1, number, (change,)))
 
     taken = [queue.get(0.0) for _ in range(5)]
     assert [getattr(one, "number", one) for one in taken] == [1, 3, 6, 7, None]
     assert taken[1:3] == [Skipped("s0", 1, 1, 3), Skipped("s0", 1, 5, 6)]
+
+
+def test_queue_keeps_few_notices_with_their_data():
+    """Behind them it only knows what has changed."""
+    queue, slot = NoticeQueue(), Slot("online", "cup", "count")
+    for number in range(1, DATA_MAX + 3):
+        change = SlotChange(slot, number, number, False, 0, Datum(b"t", b"d", 1))
+        queue.put(Notice("s0", 1, number, (change,)))
+
+    kept = [queue.get(0.0).changes[0] for _ in range(DATA_MAX + 2)]
+    assert [change.version for change in kept] == list(range(1, DATA_MAX + 3))
+    assert [change.datum is not None for change in kept] == DATA_MAX * [True] + 2 * [False]
 
 
 def test_interest_is_in_context_aspect_and_pattern():
@@ -116,7 +128,7 @@ def test_interest_is_in_context_aspect_and_pattern():
               Slot("online", "tray", "mass")]  # fmt: skip
 
     def covers(*slots):
-        return interest.covers(Notice("s0", 1, 1, tuple((s, 1, 1, False, 0) for s in slots)))
+        return interest.covers(Notice("s0", 1, 1, tuple(SlotChange(s, 1, 1, False) for s in slots)))
 
     assert covers(*others, fits)
     assert covers(fits._replace(entity="tray"))
@@ -191,7 +203,7 @@ def watched():
 
 def framed(number, names=("a",)):
     """Return the bytes of a notice."""
-    changes = tuple((Slot("online", name, "mesh"), number, 1, False, 0) for name in names)
+    changes = tuple(SlotChange(Slot("online", name, "mesh"), number, 1, False) for name in names)
     header, payload = encode_frame(Notice("s0", 1, number, changes))
     return prefixed(header, len(payload or b"")) + (payload or b"")
 

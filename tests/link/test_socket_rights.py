@@ -17,6 +17,7 @@ from enact_dist.core.rights.rules import Rights
 from enact_dist.errors import LinkError, PermissionDeniedError
 from enact_dist.link.daemon.daemon import start_shard
 from enact_dist.link.daemon.settings import DaemonSettings
+from enact_dist.link.notices import NoticeQueue
 from enact_dist.link.socket import service
 from enact_dist.link.socket.peers import PeerCredentials, peer_of
 from enact_dist.verify.floods.raw import RawZenoh
@@ -157,6 +158,40 @@ def test_a_watch_over_the_socket_leaves_out_what_is_not_readable(tmp_path):
         changes = [watch.next(5.0) for _ in range(2)]
         assert {change.entity.name for change in changes} == {"view/1"}
         assert watch.next(0.2) is None
+
+
+def test_a_notice_carries_only_data_that_its_watcher_may_read(tmp_path, monkeypatch):
+    """Of a commit of several, to an observer, too; what is not readable never reaches its process."""
+    came, take = [], NoticeQueue.take
+
+    def noted(queue, found):
+        found = list(found)
+        came.extend((queue, change) for one in found for change in getattr(one, "changes", ()))
+        take(queue, found)
+
+    monkeypatch.setattr(NoticeQueue, "take", noted)
+    with ExitStack() as stack:
+        _, file = stack.enter_context(guarded(tmp_path))
+        ada = stack.enter_context(connect(file, actor="ada"))
+        watchers = [
+            stack.enter_context(connect(file, actor=name, observer=observer))
+            for name, observer in (("camera", False), ("camera", True), ("ada", False))
+        ]
+        watches = [
+            stack.enter_context(one.world("online").watch("**", COUNT, data=True))
+            for one in watchers
+        ]
+        both = [Write(ada.world("online"), Entity(name), COUNT) for name in ("secret", "view/1")]
+        with Lock(*both) as lock:
+            for request in both:
+                lock[request] = 41
+        assert all(watch.next(5.0) is not None for watch in watches)
+        each = [
+            [(change.slot.entity, change.datum is not None) for queue, change in came if queue is w]
+            for w in (watch._feed for watch in watches)
+        ]
+    view, secret = ("view/1", True), ("secret", True)
+    assert each == [[view], [view], [secret, view]]
 
 
 def test_a_reload_changes_whose_rights_a_connection_uses(tmp_path, monkeypatch):

@@ -17,6 +17,7 @@ from enact_dist.core.protocol.messages import (
     ListLocks,
     Locks,
     Notice,
+    SlotChange,
     Survey,
 )
 from enact_dist.core.state import grants as tenures
@@ -25,6 +26,7 @@ from enact_dist.link.socket import connection as socket_connection
 from enact_dist.link.socket import service as socket_service
 from enact_dist.link.socket import watcher as socket_watcher
 from enact_dist.link.socket.frames import FrameKind, Stream, read_skipped, send_frame
+from enact_dist.link.socket.watcher import OutgoingNotice
 from enact_dist.terms import Access
 from enact_dist.wire.frames import decode_frame, encode_frame
 
@@ -122,9 +124,40 @@ def test_watcher_that_does_not_read_delays_no_commit(raw, make_peer, monkeypatch
     peer = make_peer(lambda _, message: ask(writer, message, stream), session="writer")
     peer.hello()
     for number in range(1500):
-        assert isinstance(_write(peer, writer, stream, number), Committed)
+        assert isinstance(_write(peer, writer, stream, b"%d" % number), Committed)
 
     assert counters(raw.shard)["notices_dropped"] > 0
+
+
+def test_what_waits_for_a_watcher_that_does_not_read_carries_no_data(raw, make_peer, until):
+    """It asked for data of 4 kB; the shard keeps the bare notices for it."""
+    near, writer = raw("watcher"), raw("writer")
+    interest, _ = encode_frame(Survey((), (), (), data=True))
+    send_frame(near, interest, kind=FrameKind.WATCH)
+    (connection,) = raw.shard._sockets._connections["watcher"]
+    connection.connected.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1)
+    until(lambda: raw.shard._sockets._watchers)
+    (watcher,) = raw.shard._sockets._watchers
+    until(lambda: not watcher._waiting)
+    stream = Stream(writer)
+    peer = make_peer(lambda _, message: ask(writer, message, stream), session="writer")
+    peer.hello()
+
+    for number in range(100):
+        body = b"%03d" % number + bytes(3_900)
+        assert isinstance(_write(peer, writer, stream, body), Committed)
+
+    waiting = [len(frame) for frame in watcher._waiting]
+    assert len(waiting) > 50
+    assert max(waiting[1:]) < 200
+    reading, found = Stream(near), []
+    near.settimeout(ANSWER_S)
+    while len(found) < 100:
+        kind, *frame = reading.receive()
+        found += [decode_frame(*frame)] if kind == FrameKind.MESSAGE else []
+    carried = [bool(one.changes[0].datum) for one in found]
+    assert carried[0]
+    assert not carried[-1]
 
 
 def test_watcher_that_reads_again_gets_all_that_was_kept_for_it(raw, monkeypatch, until):
@@ -163,14 +196,14 @@ def test_watcher_whose_numbers_are_dropped_does_not_hold_up_a_commit(monkeypatch
         with mutex:
             timer.start()
             assert counting.wait(ANSWER_S)
-            watcher.put(Notice("s0", 1, 2, ()), b"")
+            watcher.put(OutgoingNotice(Notice("s0", 1, 2, ())))
 
     service = SimpleNamespace(host=SimpleNamespace(count=count))
     near, far = socket.socketpair()
     with near, far:
         cup = Interest(Survey(("online",), ("cup",), ("count",)))
         watcher = socket_watcher.SocketWatcher(service, near, cup)
-        watcher.put(Notice("s0", 1, 1, ()), b"")
+        watcher.put(OutgoingNotice(Notice("s0", 1, 1, ())))
         timer = threading.Thread(target=watcher.tell_skipped, daemon=True)
         commit = threading.Thread(target=publish, daemon=True)
         commit.start()
@@ -237,7 +270,7 @@ def test_watcher_gets_what_it_watches_and_the_numbers_of_the_rest(raw):
     service, epoch = raw.shard._sockets, raw.shard.host.epoch
 
     def publish(number, entity):
-        change = (Slot("online", entity, "count"), 1, 1, False, 0)
+        change = SlotChange(Slot("online", entity, "count"), 1, 1, False)
         service._publish(Notice("s0", epoch, number, (change,)))
 
     for number, entity in ((11, "tray"), (12, "tray"), (13, "cup"), (14, "tray")):
@@ -262,12 +295,12 @@ def test_watcher_that_says_nonsense_is_refused(raw):
     assert b"ListLocks came instead of what to watch" in text
 
 
-def _write(peer, writer, stream, number):
+def _write(peer, writer, stream, body):
     granted = peer.acquire("cup")
     from enact_dist.core.protocol.datum import Datum, Slot
     from enact_dist.core.protocol.messages import Commit, WriteItem
 
-    datum = Datum(b"\x01", b"%d" % number, len(b"%d" % number))
+    datum = Datum(b"\x01", body, len(body))
     item = WriteItem(Slot("online", "cup", "count"), datum)
     header, payload = encode_frame(Commit(granted.lock, granted.token, (item,), 0))
     send_frame(writer, header, [payload])

@@ -120,7 +120,7 @@ def test_frame_with_a_list_of_other_types_is_refused(entry):
     holder = [list(LOCK), 1, "a", "h", 1, True, "w", 0, 0, 0, [], [7, waits_for], ""]
 
     with pytest.raises(ProtocolError, match="a list of str"):
-        decode_frame(header_of(13, ["online", entry], [], [], False, [0, [], 0, 0]))
+        decode_frame(header_of(13, ["online", entry], [], [], False, [0, [], 0, 0], False))
     with pytest.raises(ProtocolError, match="a list of int"):
         decode_frame(header_of(49, 1, [holder], [0, [], 0, 0]))
 

@@ -69,11 +69,11 @@ def test_request_of_too_many_values_is_refused():
 
 def test_request_of_too_many_fields_is_refused_before_they_are_read():
     """Ten million of them fit into a header, and its end is never come to here."""
-    header = header_of(m.Survey, (), (), (), False, m.START)
+    header = header_of(m.Survey, (), (), (), False, m.START, False)
     count = limits.HEADER_BYTES_MAX - 100
     header = b"\xdd" + count.to_bytes(4, "big") + header[1:] + b"\xc0" * LONG
 
-    with pytest.raises(ProtocolError, match=f"Survey has 5 fields, {count - 2} came"):
+    with pytest.raises(ProtocolError, match=f"Survey has 6 fields, {count - 2} came"):
         decode_request(header)
 
 

@@ -356,6 +356,7 @@ class ActorRun:
                 members=members,
                 tick_ns=tick_ns,
                 after=after,
+                shown=self._sets.shown(members) if self._sets is not None and members else (),
             )
             self._standing = bool(after)
             with lock:

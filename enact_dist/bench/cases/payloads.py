@@ -270,10 +270,15 @@ def _storing(world: WorldContext, size: str, count: int) -> Callable[[float], Se
 def run_wakeup(run: Run) -> None:
     """From the commit of a change in one process to another one that has it, under a lock.
 
-    A watch tells of the change, and a lock then fetches it; the lock of an actor waits for it.
+    A watch tells of the change, and a lock then fetches it; the notice of a watch that asks for
+    data brings it, under no lock; the lock of an actor waits for it.
     """
     floor = floor_of(run.place.way(run.place.carrier))
-    ways = {"{}": _woken_by_watch, "{}, as an actor": _woken_as_actor}
+    ways = {
+        "{}": _woken_by_watch,
+        "{}, by its notice": _woken_by_notice,
+        "{}, as an actor": _woken_as_actor,
+    }
     run.measure(
         [
             Case(
@@ -327,6 +332,16 @@ def _woken_by_watch(
         while not over and watch.next(timeout_s=WAIT_S) is not None:
             with Lock(read, wait_s=WAIT_S) as lock:
                 over = take(lock[read])
+
+
+def _woken_by_notice(
+    cell: Cell, of: Entity, begin: Callable[[], None], take: Callable[[Any], bool]
+) -> None:
+    world, over = cell.world(WORLD), False
+    with world.watch(of, ARRAY, data=True) as watch:
+        begin()
+        while not over and (change := watch.next(timeout_s=WAIT_S)) is not None:
+            over = take(watch.value(change))
 
 
 def _woken_as_actor(

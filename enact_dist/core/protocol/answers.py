@@ -467,13 +467,17 @@ Answer = (
 
 
 class SlotChange(NamedTuple):
-    """One committed write, without its data; `captured_ns` is the datum's own stamp (0: none)."""
+    """One committed write; `captured_ns` is the datum's own stamp (0: none).
+
+    `datum` travels only to a watch that asked for data, and only where it is small.
+    """
 
     slot: Slot
     version: int
     stamp_ns: int
     null: bool
     captured_ns: int = 0
+    datum: Datum | None = None
 
 
 @message

@@ -281,6 +281,7 @@ class Survey:
 
     Empty `contexts` or `aspects` mean all; `patterns` are entity patterns, empty means all.
     With `retained` the retained versions of each slot come before its newest one, oldest first.
+    Where a watch names with it what it wants, `data` asks for small data in the notices.
     A listing of several pages is no consistent snapshot: each page shows its slots as they are when
     it is requested.
     """
@@ -290,6 +291,7 @@ class Survey:
     aspects: tuple[str, ...]
     retained: bool = False
     after: Cursor = START
+    data: bool = False
 
 
 @message

@@ -1,8 +1,9 @@
-"""What a shard shows to people: holders, sessions, slots.  Reads state, changes none."""
+"""What a shard shows to people and watchers: holders, sessions, slots.  Changes no state."""
 
 from __future__ import annotations
 
 from bisect import bisect_right
+from dataclasses import replace
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
@@ -15,9 +16,11 @@ from enact_dist.core.protocol.messages import (
     ListLocks,
     ListSessions,
     Locks,
+    Notice,
     Pong,
     SessionInfo,
     Sessions,
+    SlotChange,
     SlotState,
     Survey,
     Surveyed,
@@ -40,11 +43,33 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.records import Content
     from enact_dist.core.shard.state import ShardState
     from enact_dist.core.state.sessions import SessionState
+    from enact_dist.core.state.slots import SlotMap
 
 REPORT_BYTES_MAX: Final = 4096
 """Longest report of an actor in a listing; a longer one is left out."""
+NOTICE_DATUM_BYTES_MAX: Final = 4 * 1024
+"""Longest datum in a notice, its encoding included."""
+NOTICE_BYTES_MAX: Final = 64 * 1024
+"""So many bytes of data travel with one notice."""
 STATE_BYTES: Final = 72
 """A state without its datum in an answer, names left out."""
+
+
+def with_data(slots: SlotMap, notice: Notice) -> Notice:
+    """Return a notice with the data of its changes that are small, or payloads, and the newest."""
+    found, left = list[SlotChange](), NOTICE_BYTES_MAX
+    for change in notice.changes:
+        content = slots[change.slot]
+        datum = content.datum if content.version == change.version else None
+        if datum is not None and datum.fault is None:
+            if datum.file:
+                datum = replace(datum, body=b"")
+            size = len(datum.encoding) + len(datum.body)
+            if size <= min(left, NOTICE_DATUM_BYTES_MAX):
+                left -= size
+                change = change._replace(datum=datum)  # noqa: PLW2901
+        found.append(change)
+    return replace(notice, changes=tuple(found))
 
 
 def locks(state: ShardState, message: ListLocks) -> Locks:

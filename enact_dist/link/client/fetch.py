@@ -124,7 +124,7 @@ def fetch_all(
     found: dict[Slot, Datum] = {}
     missing: list[_Incoming] = []
     for reading in readings:
-        datum = _at_hand(client, cache, reading)
+        datum = at_hand(client, cache, reading)
         if datum is not None:
             found[reading.state.slot] = datum
         else:
@@ -142,7 +142,8 @@ def fetch_all(
     return found
 
 
-def _at_hand(client: CellClient, cache: DatumCache, reading: Reading) -> Datum | None:
+def at_hand(client: CellClient, cache: DatumCache, reading: Reading) -> Datum | None:
+    """Return the datum of a reading that carries it, or names it in shared memory, or is cached."""
     shard, epoch, state = reading
     if state.datum is not None and not state.large:
         cache.put(state.slot, shard, epoch, state.version, state.datum)

@@ -136,7 +136,10 @@ class EmbeddedCarrier:
         """Open a feed of the shard's notices."""
         self._check_usable()
         feed = NoticeQueue(interest)
-        unwatch = self._host.watch(feed.put)
+        put = feed.put
+        if interest is not None and interest.data:
+            put = lambda notice: feed.put(self._host.with_data(notice))  # noqa: E731
+        unwatch = self._host.watch(put)
 
         def end() -> None:
             unwatch()

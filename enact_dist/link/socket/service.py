@@ -23,10 +23,10 @@ from enact_dist.core.protocol.records import SessionBarred, SessionDied
 from enact_dist.core.shard.owners import is_shard, not_yours
 from enact_dist.errors import LinkError
 from enact_dist.link.socket.connection import SocketConnection
-from enact_dist.link.socket.frames import end_socket, prefixed
+from enact_dist.link.socket.frames import end_socket
 from enact_dist.link.socket.peers import Deaths, PeerCredentials, check_peer
+from enact_dist.link.socket.watcher import OutgoingNotice
 from enact_dist.link.zenoh.access import opens
-from enact_dist.wire.frames import encode_frame
 from enact_dist.wire.keys import name_in
 
 if TYPE_CHECKING:
@@ -275,12 +275,13 @@ class SocketService:
 
     def _publish(self, notice: Notice) -> None:
         """Send a notice to all watchers without blocking.  The host's mutex is held."""
-        watchers = self._watchers
-        if watchers:
-            header, payload = encode_frame(notice)
-            frame = prefixed(header, len(payload or b"")) + (payload or b"")
-            for watcher in watchers:
-                watcher.put(notice, frame)
+        bare, whole = OutgoingNotice(notice), None
+        for watcher in self._watchers:
+            if watcher.takes_data(notice):
+                whole = whole or OutgoingNotice(self.host.with_data(notice))
+                watcher.put(whole)
+            else:
+                watcher.put(bare)
 
     def _tell_skipped(self) -> None:
         for watcher in self._watchers:

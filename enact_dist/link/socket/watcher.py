@@ -36,6 +36,23 @@ SKIP_S: Final = 0.25
 """After this time the numbers of skipped notices are sent on their own."""
 
 
+class OutgoingNotice:
+    """A notice and its frame, encoded once for all watchers, and only if one of them wants it."""
+
+    __slots__ = ("_frame", "notice")
+
+    def __init__(self, notice: Notice) -> None:
+        self.notice, self._frame = notice, b""
+
+    @property
+    def frame(self) -> bytes:
+        """The whole frame."""
+        if not self._frame:
+            header, payload = encode_frame(self.notice)
+            self._frame = prefixed(header, len(payload or b"")) + (payload or b"")
+        return self._frame
+
+
 class Publisher(Protocol):
     """What a watcher needs of the service that sends it notices."""
 
@@ -76,19 +93,22 @@ class SocketWatcher:
         self._waiting = deque([memoryview(prefixed(b"", 0, FrameKind.OPENED))])
         self._bell = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
 
-    def put(self, notice: Notice, frame: bytes) -> None:
-        """Send the frame of a notice, if it is watched; by one thread at a time."""
-        kept, hidden = True, False
+    def takes_data(self, notice: Notice) -> bool:
+        """Whether a notice may carry data: not while others wait for it, so they take no memory."""
+        interest = self._interest
+        wants = interest is not None and interest.wanted.data and not self._waiting
+        return wants and interest.covers(notice)  # type: ignore[union-attr]  # it wants data
+
+    def put(self, outgoing: OutgoingNotice) -> None:
+        """Send a notice, if it is watched; by one thread at a time."""
+        kept, hidden, notice = True, False, outgoing.notice
         if self._may_read is not None:
-            whole = notice
-            notice = self._readable(whole, self._may_read)
-            hidden = notice is not whole and not notice.changes
-            if notice is not whole and not hidden:
-                header, payload = encode_frame(notice)
-                frame = prefixed(header, len(payload or b"")) + (payload or b"")
+            notice = self._readable(outgoing.notice, self._may_read)
+            if notice is not outgoing.notice:
+                hidden, outgoing = not notice.changes, OutgoingNotice(notice)
         with self._mutex:
             if not hidden and (self._interest is None or self._interest.covers(notice)):
-                kept = self._send(self._taken_skipped() + frame)
+                kept = self._send(self._taken_skipped() + outgoing.frame)
             elif self._skipped is None:
                 number = notice.number
                 self._skipped = Skipped(notice.shard, notice.epoch, number - 1, number)
