@@ -28,7 +28,7 @@ from weakref import WeakKeyDictionary
 
 import msgpack
 
-from enact_dist.core.shard.inspection import REPORT_BYTES_MAX
+from enact_dist.core.protocol.messages import REPORT_BYTES_MAX
 from enact_dist.errors import CommitUnknownError, ProtocolError
 
 if TYPE_CHECKING:

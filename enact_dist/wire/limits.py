@@ -52,8 +52,9 @@ REASON_CHARACTERS_MAX: Final = 500
 """Longest reason of a manual action: it is stored permanently and printed in one table line."""
 TEXT_BYTES_MAX: Final = 64 << 10
 """Longest string of a header that is no name: causes, endpoints, fingerprints, reasons."""
-REPORT_BYTES_MAX: Final = 64 << 10
-"""Longest report of an actor: each keep-alive carries it."""
+REPORT_FIELD_BYTES_MAX: Final = 64 << 10
+"""Longest `report` that a keep-alive can have; a shard keeps one of at most
+`core.protocol.requests.REPORT_BYTES_MAX`, and counts longer ones."""
 ITEMS_MAX: Final = 4096
 """Most lines of one lock and most writes of one commit.  A shard grants a lock, and applies a
 commit, in one step, which is what makes them atomic, and serves no other client meanwhile: about

@@ -29,7 +29,7 @@ from enact_dist.wire.limits import (
     KEPT_VERSIONS_MAX,
     NAME_CHARACTERS_MAX,
     REASON_CHARACTERS_MAX,
-    REPORT_BYTES_MAX,
+    REPORT_FIELD_BYTES_MAX,
 )
 
 Write = Callable[[Any, BodyWriter], Any]
@@ -53,7 +53,7 @@ LENGTHS_MAX: Final = {
     "items": ITEMS_MAX,
     "writes": ITEMS_MAX,
     "expects": ITEMS_MAX,
-    "report": REPORT_BYTES_MAX,
+    "report": REPORT_FIELD_BYTES_MAX,
     "encoding": ENCODING_BYTES_MAX + 1,
 }
 """Longest content of a field by its name; the version stands before the tree in `encoding`."""

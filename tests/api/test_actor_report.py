@@ -16,7 +16,7 @@ from enact_dist.actor.report import (
     percentile,
     read_reports,
 )
-from enact_dist.core.shard.inspection import REPORT_BYTES_MAX
+from enact_dist.core.protocol.messages import REPORT_BYTES_MAX
 from enact_dist.errors import CommitUnknownError, ProtocolError
 from enact_dist.world.listings import unpacked_report
 

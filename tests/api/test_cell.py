@@ -243,6 +243,15 @@ def test_actors_are_listed_when_a_report_cannot_be_read(cell, report):
     assert [actor.report for actor in cell.actors()] == [{}]
 
 
+@pytest.mark.carrier("local")
+def test_report_that_a_shard_would_leave_out_is_refused(cell):
+    """The error names the size and the limit; the report before it stays."""
+    cell.set_report(msgpack.packb({"updates": 3}))
+    with pytest.raises(MisuseError, match="4097 bytes; at most 4096"):
+        cell.set_report(bytes(4097))
+    assert [actor.report for actor in cell.actors()] == [{"updates": 3}]
+
+
 def test_set_report_is_quiet_when_cell_is_closed(cell):
     """A last report after the end is no error."""
     cell.close()

@@ -7,6 +7,7 @@ from shard_bench import MS, S, ShardBench, item, lock_id, slot
 from enact_dist.core.protocol.datum import Datum
 from enact_dist.core.protocol.messages import (
     OUTCOME_COMMITTED,
+    REPORT_BYTES_MAX,
     AwaitStamp,
     Commit,
     Fetch,
@@ -16,7 +17,6 @@ from enact_dist.core.protocol.messages import (
     Slice,
     WriteItem,
 )
-from enact_dist.core.shard.inspection import REPORT_BYTES_MAX
 from enact_dist.terms import Access
 
 W, WE, VE = Access.WRITE, Access.WRITE_EACH, Access.VIEW_EACH
@@ -77,7 +77,10 @@ def test_wait_for_a_stamp_is_answered_after_a_slice_however_long_it_asks():
 
 
 def test_report_that_no_listing_shows_is_not_kept_either():
-    """Thousands of sessions with the longest report of the wire would take most of a gigabyte."""
+    """Thousands of sessions with the longest report of the wire would take most of a gigabyte.
+
+    The shard renews such a session all the same, and counts what it left out.
+    """
     bench = ShardBench()
     bench.hello("ann")
     kept = []
@@ -86,3 +89,4 @@ def test_report_that_no_listing_shows_is_not_kept_either():
         kept.append(len(bench.shard.state.sessions.by_id["ann"].report))
 
     assert kept == [REPORT_BYTES_MAX, REPORT_BYTES_MAX, 0]
+    assert bench.counter("reports_too_long") == 1

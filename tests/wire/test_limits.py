@@ -38,7 +38,7 @@ def commit(*writes, expects=()):
 NAME = "n" * limits.NAME_CHARACTERS_MAX
 TEXT = "t" * limits.TEXT_BYTES_MAX
 WIDE = "ü" * (limits.TEXT_BYTES_MAX // 2)
-REPORT = b"r" * limits.REPORT_BYTES_MAX
+REPORT = b"r" * limits.REPORT_FIELD_BYTES_MAX
 ENCODING = b"e" * (limits.ENCODING_BYTES_MAX + 1)
 
 

@@ -28,7 +28,7 @@ def header_of(cls, *fields, code=None):
         m.Explain(VERSIONS * limits.ITEMS_MAX),
         m.Commit(LOCK, TOKEN, (WRITE,) * limits.ITEMS_MAX, 0, VERSIONS * limits.ITEMS_MAX),
         m.KeepVersions("s", "label", VERSIONS * limits.KEPT_VERSIONS_MAX, 1, 1),
-        m.KeepAlive("s", 1, 1, (), b"r" * limits.REPORT_BYTES_MAX),
+        m.KeepAlive("s", 1, 1, (), b"r" * limits.REPORT_FIELD_BYTES_MAX),
         m.Register("s", tuple(f"w{index}" for index in range(LONG)), ()),
     ],
     ids=lambda message: type(message).__name__,

@@ -105,6 +105,7 @@ from enact_dist.core.protocol.parts import (
 )
 from enact_dist.core.protocol.requests import (
     PAGED,
+    REPORT_BYTES_MAX,
     Acquire,
     AwaitStamp,
     Break,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 from enact_dist.core.protocol.datum import Datum, LockId, Position, Slot, Token, message
 from enact_dist.core.protocol.parts import (
     START,
@@ -108,6 +110,10 @@ class Fetch:
     version: int
     offset: int
     length: int
+
+
+REPORT_BYTES_MAX: Final = 4096
+"""Longest report of an actor that a shard keeps; a client refuses to send a longer one."""
 
 
 @message

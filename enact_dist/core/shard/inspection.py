@@ -45,8 +45,6 @@ if TYPE_CHECKING:
     from enact_dist.core.state.sessions import SessionState
     from enact_dist.core.state.slots import SlotMap
 
-REPORT_BYTES_MAX: Final = 4096
-"""Longest report of an actor in a listing; a longer one is left out."""
 NOTICE_DATUM_BYTES_MAX: Final = 4 * 1024
 """Longest datum in a notice, its encoding included."""
 NOTICE_BYTES_MAX: Final = 64 * 1024

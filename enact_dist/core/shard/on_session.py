@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.checks import wrong_aspect, wrong_name
 from enact_dist.core.protocol.messages import (
+    REPORT_BYTES_MAX,
     Alive,
     Answer,
     EpochChanged,
@@ -37,7 +38,6 @@ from enact_dist.core.protocol.records import (
 )
 from enact_dist.core.rights.rules import UNPROVEN
 from enact_dist.core.shard import owners
-from enact_dist.core.shard.inspection import REPORT_BYTES_MAX
 from enact_dist.terms import Durability
 
 if TYPE_CHECKING:
@@ -205,8 +205,11 @@ class SessionHandler:
             yield Reply(reply_to, EpochChanged(self._state.epoch))
             return
         session.renew(self._state.now_ns, message.count)
-        if message.report:  # kept for listings, which leave longer ones out
-            session.report = message.report if len(message.report) <= REPORT_BYTES_MAX else b""
+        if len(message.report) > REPORT_BYTES_MAX:
+            session.report = b""
+            self._state.count("reports_too_long")
+        elif message.report:
+            session.report = message.report
         guard = self._state.guard
         proven = guard is None or guard.subject != UNPROVEN  # what ends locks has to be
         lowest = {view.lane: view.seq for view in message.view if proven}

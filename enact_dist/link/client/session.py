@@ -26,6 +26,7 @@ from enact_dist.core.client.backoff import (
     Backoff,
 )
 from enact_dist.core.protocol.messages import (
+    REPORT_BYTES_MAX,
     Alive,
     Answer,
     AspectEntry,
@@ -114,10 +115,7 @@ class SessionClient:
         self._lanes = Lanes()
         self.catalogue = KnownCatalogue()
         self.payloads = SharedPayloads(
-            client.session,
-            weakly(self._staged),
-            weakly(self.count),
-            inside=carrier.inside,
+            client.session, weakly(self._staged), weakly(self.count), inside=carrier.inside
         )
         self._kept = KeptUses(client, self.payloads, self._mutex, now_ns, self.counters)
         self._further = FurtherShards(carrier, client.placement, now_ns, weakly(self.count), doubts)
@@ -484,7 +482,9 @@ class SessionClient:
                 self.count("keep_alives_unanswered")
 
     def set_report(self, report: bytes) -> None:
-        """Set what the next keep-alives carry: this actor's statistics (msgpack)."""
+        """Set what the next keep-alives carry: an actor's statistics, msgpack of a map."""
+        if (size := len(report)) > REPORT_BYTES_MAX:
+            raise MisuseError(f"a report of {size} bytes; at most {REPORT_BYTES_MAX} are kept")
         if self.forked or self.closed:
             return
         with self._mutex:

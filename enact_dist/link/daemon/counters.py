@@ -94,6 +94,7 @@ OF_A_SHARD: Final[dict[str, Figure]] = {
         "locks refused until their client compares its type with the newer one",
         "update programs that write an older type: enact actor ls, and their logs",
     ),
+    "reports_too_long": Figure("keep-alives whose actor's report was too long to be kept"),
     "types_succeeded": Figure("times that an aspect got a newer type, with more fields"),
     "wrong_shard": Figure(
         "requests from clients with a different list of shards",
