@@ -15,6 +15,7 @@ LAYERS = (
     ("errors",),
     ("comparing", "extras", "patterns", "retention"),
     ("terms",),
+    ("outcome",),
     ("core.protocol",),
     ("core.failover", "core.rights"),
     ("core.state",),
@@ -69,7 +70,7 @@ ACTORS_MAY_IMPORT = {
     "enact_dist", "enact_dist.errors", "enact_dist.recording", "enact_dist.testing",
 }  # fmt: skip
 ACTORS_STILL_IMPORT = {
-    "actor.binding", "actor.check", "actor.graph", "actor.outcome", "actor.running.load",
+    "actor.binding", "actor.check", "actor.graph", "outcome", "actor.running.load",
     "actor.running.process", "actor.running.commands", "compare.diff", "config.read",
     "core.protocol.datum", "link.signals", "wire.payload", "world.lineage", "world.trees",
 }  # fmt: skip

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from actors.palletizing.handling.nets import Execution
     from actors.palletizing.vocabulary import Attached, Control
     from enact_dist import Lock
-    from enact_dist.actor.outcome import Outcome
+    from enact_dist.outcome import Outcome
 
 LEASE_S: Final = 2.0
 OPENING_S: Final = 5.0

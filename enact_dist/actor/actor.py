@@ -27,8 +27,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Self
 
 from enact_dist.access.together import Together
-from enact_dist.actor.outcome import Outcome, outcome_of
 from enact_dist.errors import MisuseError
+from enact_dist.outcome import Outcome, outcome_of
 from enact_dist.patterns import patterns_overlap
 from enact_dist.terms import (
     Entities,

@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from enact_dist.access.trigger import Newer
-    from enact_dist.actor.outcome import Outcome
     from enact_dist.core.client.plan import Reading
     from enact_dist.core.protocol.messages import DatumRead, Item
+    from enact_dist.outcome import Outcome
 
 
 R = TypeVar("R", bound=LockRequest[Any])

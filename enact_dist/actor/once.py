@@ -29,7 +29,6 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from enact_dist.access.lock import Lock
 from enact_dist.access.trigger import Newer
 from enact_dist.actor.inbox import Inbox
-from enact_dist.actor.outcome import Outcome, Seen, is_new
 from enact_dist.actor.running.doing import Doing, place_of
 from enact_dist.actor.triggers import BackOff
 from enact_dist.errors import (
@@ -41,6 +40,7 @@ from enact_dist.errors import (
     LockTimeoutError,
 )
 from enact_dist.link.clock import wall_ns
+from enact_dist.outcome import Outcome, Seen, is_new
 from enact_dist.terms import Entities, Entity, LockRequestOne, View, Write
 
 if TYPE_CHECKING:

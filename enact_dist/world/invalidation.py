@@ -25,8 +25,11 @@ import contextlib
 from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.access.asking import explained
+from enact_dist.core.protocol.datum_types import same_type, succeeds
 from enact_dist.core.protocol.messages import DatumRead, SlotVersion
 from enact_dist.errors import EnactError, ForgottenError, MisuseError, NoRoomError, NullDatumError
+from enact_dist.outcome import Outcome
+from enact_dist.wire.fingerprint import fingerprint
 from enact_dist.wire.limits import ITEMS_MAX
 from enact_dist.world.context import Version
 from enact_dist.world.lineage import EffectTree, Made, Search
@@ -42,8 +45,6 @@ if TYPE_CHECKING:
 ROUNDS_MAX: Final = 100
 """So often effects are looked for: an actor that viewed a version before makes one more."""
 HOLD_S: Final = 60.0
-OUTCOME: Final = "Outcome{state:str,version:int,committed_ns:int,"
-"""How the type of an outcome begins (`actor.outcome`)."""
 
 
 def invalidate(
@@ -145,8 +146,14 @@ def _shown(session: Session, made: dict[DatumRead, EffectTree]) -> dict[Slot, Da
         state.slot: DatumRead(*state[:3])
         for state in states
         if DatumRead(*state[:3]) in made and not state.null_reason
-        if not aspects[state.slot.aspect].fingerprint.startswith(OUTCOME)
+        if not _is_outcome(aspects[state.slot.aspect].fingerprint)
     }
+
+
+def _is_outcome(datum_type: str) -> bool:
+    """Whether data of this type are outcomes; a later release may have added fields to it."""
+    own = fingerprint(Outcome)
+    return same_type(datum_type, own) or succeeds(datum_type, own)
 
 
 def _replaced(

@@ -22,9 +22,9 @@ from enact_dist import (
     local,
     testing,
 )
-from enact_dist.actor.outcome import Outcome
 from enact_dist.actor.running.step import Step
 from enact_dist.errors import ForgottenError, MisuseError, NullDatumError
+from enact_dist.outcome import Outcome
 
 LEVEL = Aspect("level_in_steps", float, compare=Tolerance(absolute=0.5))
 SUM = Aspect("sum_in_steps", float)

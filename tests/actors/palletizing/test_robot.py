@@ -32,8 +32,8 @@ from actors.palletizing.vocabulary import (
 )
 from actors.workcell.vocabulary import JOINTS
 from enact_dist import Lock, View, Write, local, testing
-from enact_dist.actor.outcome import Outcome
 from enact_dist.actor.running.process import ActorThread
+from enact_dist.outcome import Outcome
 
 from .sound_nets import axes, net, primitive, way
 from .spring_arm import ARM, HOME_RAD, SpringArm
