@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import logging
-import threading
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING
 
-from enact_dist import run_actor
+from enact_dist import ActorThread
 from enact_dist.errors import EnactError
 
 if TYPE_CHECKING:
@@ -19,30 +18,21 @@ if TYPE_CHECKING:
 @contextmanager
 def running(actors: Sequence[Actor], cell: Cell) -> Iterator[list[Exception]]:
     """Run actors in threads for the length of a block; yield what went wrong in them."""
-    stop, failures = threading.Event(), list[Exception]()
+    failures = list[Exception]()
 
     def failed(_: Entity | None, error: Exception) -> None:
         if not isinstance(error, EnactError):  # those the framework tries again by itself
             failures.append(error)
 
-    threads = [
-        threading.Thread(
-            target=run_actor,
-            args=(actor, cell),
-            kwargs={"stop": stop, "on_error": failed},
-            name=type(actor).__name__,
-        )
-        for actor in actors
-    ]
+    threads = [ActorThread(actor, cell, on_error=failed) for actor in actors]
     # A failure ends the run with one line of its own; its traceback in the log says no more.
     log = logging.getLogger("enact.actor")
-    heard, log.disabled = log.disabled, True
-    for thread in threads:
-        thread.start()
-    try:
-        yield failures
-    finally:
-        stop.set()
+    with ExitStack() as last_first:
+        last_first.callback(setattr, log, "disabled", log.disabled)
+        log.disabled = True
         for thread in threads:
-            thread.join()
-        log.disabled = heard
+            last_first.callback(thread.join)
+            thread.start()
+        for thread in threads:
+            last_first.callback(thread.stop)
+        yield failures

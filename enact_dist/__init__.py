@@ -1,8 +1,17 @@
 """Distributed world contexts for robots: leased, fenced, atomic locks over many data.
 
 World contexts map (entity, aspect) to a datum or null; actors lock several data at once, readers
-and writers, over any number of shards (after ENACT, an entity-aspect-actor framework).  The errors
-stand in `enact_dist.errors`, drawn as a tree.
+and writers, over any number of shards (after ENACT, an entity-aspect-actor framework).
+
+::
+
+    enact_dist              what a program or an actor is made of
+    enact_dist.errors       the errors, drawn as a tree
+    enact_dist.types        the types of what calls return, for annotations
+    enact_dist.testing      actors in this process, on a manual clock
+    enact_dist.recording    recordings and their replay
+
+Everything else is internal, but for what pages of `docs/` name.
 
 What a shard's daemon does without is loaded at its first use: the client's half would keep a
 restarted shard from its clients for a fifth longer (55 ms of processor time, measured).
@@ -13,12 +22,10 @@ from typing import TYPE_CHECKING
 
 from enact_dist.core.protocol.datum import Position
 from enact_dist.terms import (
-    NULL,
     Aspect,
     Durability,
     Entities,
     Entity,
-    NullReason,
     Read,
     ReadEach,
     Retention,
@@ -31,42 +38,35 @@ from enact_dist.terms import (
 
 if TYPE_CHECKING:
     from enact_dist.access.lock import Lock
-    from enact_dist.access.snapshot import Snapshot
     from enact_dist.access.together import Together
-    from enact_dist.access.watch import Change, Watch
     from enact_dist.actor.actor import Actor
-    from enact_dist.actor.running.runner import run_actor
+    from enact_dist.actor.running.process import ActorThread
     from enact_dist.comparing import Difference, Tolerance
+    from enact_dist.outcome import Outcome
     from enact_dist.wire.codecs import register_codec
     from enact_dist.world.cell import Cell
     from enact_dist.world.connecting import connect, local
-    from enact_dist.world.context import Version, WorldContext
-    from enact_dist.world.past import PastContext
+    from enact_dist.world.context import WorldContext
 
 __all__ = [
-    "NULL",
     "Actor",
+    "ActorThread",
     "Aspect",
     "Cell",
-    "Change",
     "Difference",
     "Durability",
     "Entities",
     "Entity",
     "Lock",
-    "NullReason",
-    "PastContext",
+    "Outcome",
     "Position",
     "Read",
     "ReadEach",
     "Retention",
-    "Snapshot",
     "Together",
     "Tolerance",
-    "Version",
     "View",
     "ViewEach",
-    "Watch",
     "World",
     "WorldContext",
     "Write",
@@ -74,26 +74,21 @@ __all__ = [
     "connect",
     "local",
     "register_codec",
-    "run_actor",
 ]
 
 _HOME_OF = {
     "Actor": "actor.actor",
+    "ActorThread": "actor.running.process",
     "Cell": "world.cell",
-    "Change": "access.watch",
     "Difference": "comparing",
     "Lock": "access.lock",
-    "PastContext": "world.past",
-    "Snapshot": "access.snapshot",
+    "Outcome": "outcome",
     "Together": "access.together",
     "Tolerance": "comparing",
-    "Version": "world.context",
-    "Watch": "access.watch",
     "WorldContext": "world.context",
     "connect": "world.connecting",
     "local": "world.connecting",
     "register_codec": "wire.codecs",
-    "run_actor": "actor.running.runner",
 }
 
 

@@ -126,7 +126,7 @@ class NullDatumError(EnactError):
     """The world context does not know the datum.
 
     Attributes:
-        reason: Why, as `enact_dist.NullReason` words it.
+        reason: Why, as `enact_dist.types.NullReason` words it.
     """
 
     def __init__(self, message: str, *, reason: str = "") -> None:

@@ -97,7 +97,7 @@ def outcome_of(
         raise MisuseError(
             f"{name} has once = True and {len(found)} requests for its outcomes; declare one:"
             f' outcome = Write({trigger.world.name}, {trigger.entity!r}, Aspect("'
-            f'{trigger.aspect.name}_outcome", Outcome)), with Outcome of enact_dist.outcome'
+            f'{trigger.aspect.name}_outcome", Outcome)), with Outcome of enact_dist'
         )
     (outcome,) = found
     if type(outcome.entity) is not type(triggers[0].entity):

@@ -8,7 +8,7 @@ entity e_i          `Entity("tray/package/3")`                             the n
 set E_a             `Entities("tray/package/*")`                           entities come at run time
                                                                            (4.2 against 3.1)
 aspect a_j, D_j     `Aspect("surface", Surface)`                           carries the datum type
-null                `NULL` with a `NullReason`                             says why nothing is known
+null                `None` of `get`, or `NullDatumError`                   says why nothing is known
 lock request        `Read`, `Write`, `View` and their `…Each`              may name several contexts
 ==================  =====================================================  =====================
 
@@ -24,7 +24,7 @@ import secrets
 import typing
 import warnings
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, TypeVar
 
 from enact_dist.errors import DatumTypeError
 from enact_dist.patterns import checked_pattern, pattern_matches
@@ -233,29 +233,6 @@ class NullReason(enum.Enum):
     EXPIRED = "expired"
     LOST = "lost: the aspect is volatile and its shard restarted"
     OUTSIDE_RETENTION = "outside retention"
-
-
-class Null:
-    """The type of `NULL`, which represents *no datum* in output and arguments."""
-
-    __slots__ = ()
-    _only: ClassVar[Any] = None
-
-    def __new__(cls) -> Self:
-        """Return the one instance."""
-        if cls._only is None:
-            cls._only = super().__new__(cls)
-        only: Self = cls._only
-        return only
-
-    def __bool__(self) -> bool:
-        return False
-
-    def __repr__(self) -> str:
-        return "NULL"
-
-
-NULL: Final = Null()
 
 
 class Access(enum.IntEnum):

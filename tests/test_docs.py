@@ -6,6 +6,7 @@ the language `console`, and files that they need, are followed in `tests/e2e/tes
 """
 
 import ast
+import importlib
 import pkgutil
 import re
 import shlex
@@ -17,6 +18,7 @@ from typing import NamedTuple
 
 import pytest
 
+import enact_dist
 from enact_dist.cli.main import build_parser
 from enact_dist.config.environment import variable_of, variables_of
 from enact_dist.config.read import load_config
@@ -55,6 +57,10 @@ _BLOCK = re.compile(
     re.DOTALL | re.MULTILINE,
 )
 _NAMED = re.compile(r"`(?:\.\./)*(\w+(?:[./]\w+)+)`")
+PUBLIC = set(re.findall(r"^    (enact_dist[.\w]*)  ", enact_dist.__doc__, re.MULTILINE))
+"""The modules that the package lists as its public ones."""
+INSIDE = {"protocol.md": {"enact_dist.wire.payload"}}
+"""What else a page imports: to show what travels."""
 OBJECTS = {"actor", "actors", "cell", "rights", "shard", "world", "zenoh"}
 """Folders whose names stand for an object, event or file, too: `world.view`, `shard.ready`."""
 
@@ -108,6 +114,26 @@ PROGRAMS = [
     if block.kind == "python" and not block.file
     if block.preamble or re.match(r"(from|import) ", block.text)
 ]
+
+
+def imports_of(block):
+    """Yield the module and the names of each import from the package; one stands on one line."""
+    text = block.preamble + block.text
+    for line in re.findall(r"^ *((?:from|import) enact_dist.*)$", text, re.MULTILINE):
+        (node,) = ast.parse(line).body
+        assert isinstance(node, ast.ImportFrom), f"{block}: {line}"
+        yield node.module, {alias.name for alias in node.names}
+
+
+@pytest.mark.parametrize("page", ALL, ids=lambda page: str(page.relative_to(ROOT)))
+def test_programs_of_a_page_import_public_names(page):
+    """A reader may rely on what a page shows."""
+    for block in (block for block in blocks_of(page) if block.kind == "python"):
+        for module, names in imports_of(block):
+            assert module in PUBLIC | INSIDE.get(page.name, set()), f"{block} imports {module}"
+            inside = {name for name in names if f"{module}.{name}" in PUBLIC}
+            there = importlib.import_module(module)
+            assert names - inside <= set(getattr(there, "__all__", vars(there))), block
 
 
 @pytest.mark.parametrize("block", PROGRAMS, ids=str)

@@ -33,8 +33,7 @@ from enact_dist import Actor, View, World, Write
 if TYPE_CHECKING:
     from actors.palletizing.handling.nets import Execution
     from actors.palletizing.vocabulary import Attached, Control
-    from enact_dist import Lock
-    from enact_dist.outcome import Outcome
+    from enact_dist import Lock, Outcome
 
 LEASE_S: Final = 2.0
 OPENING_S: Final = 5.0

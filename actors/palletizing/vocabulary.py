@@ -55,7 +55,7 @@ from actors.palletizing.handling.data import Sight as Sight  # noqa: PLC0414
 from actors.palletizing.handling.nets import Execution
 from actors.palletizing.placing.finger_room import Grasp
 from enact_dist import Aspect, Durability, Entities, Entity, Retention, Tolerance
-from enact_dist.outcome import Outcome as NetOutcome
+from enact_dist import Outcome as NetOutcome
 
 PRODUCTS: Final = Entities("product/*")
 VIEWS: Final = Entities("view/*/*")

@@ -2,9 +2,9 @@
 
 import threading
 
+from enact_dist import Outcome
 from enact_dist.access.lock import Lock
 from enact_dist.actor.actor import Actor
-from enact_dist.outcome import Outcome
 from enact_dist.terms import (
     Aspect,
     Entities,

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from enact_dist import testing
+from enact_dist import ActorThread, testing
 from enact_dist.access.lock import Lock
 from enact_dist.actor import binding as actor_binding
 from enact_dist.actor.actor import Actor
 from enact_dist.actor.binding import BoundActor
 from enact_dist.actor.inbox import Inbox, Watching
 from enact_dist.actor.report import read_reports
-from enact_dist.actor.running.process import ActorThread, actor_command
+from enact_dist.actor.running.process import actor_command
 from enact_dist.actor.running.runner import run_actor
 from enact_dist.errors import (
     ChangedError,

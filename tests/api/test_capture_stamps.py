@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from slots import put
 
-from enact_dist import testing
+from enact_dist import ActorThread, testing
 from enact_dist.access.lock import Lock
 from enact_dist.access.together import Together
 from enact_dist.actor.actor import Actor
-from enact_dist.actor.running.process import ActorThread
 from enact_dist.errors import MisuseError
 from enact_dist.terms import (
     Aspect,

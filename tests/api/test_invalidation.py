@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import pytest
 
-from enact_dist import Aspect, Entity, Lock, Read, View, Write, connect
+from enact_dist import Aspect, Entity, Lock, Outcome, Read, View, Write, connect
 from enact_dist.errors import ForgottenError, LockTimeoutError, MisuseError, NullDatumError
-from enact_dist.outcome import Outcome
 from enact_dist.world import invalidation
 
 

@@ -18,14 +18,12 @@ from once_robot import (
     write,
 )
 
-from enact_dist import testing
+from enact_dist import ActorThread, Outcome, testing
 from enact_dist.access.lock import Lock
 from enact_dist.actor import once
 from enact_dist.actor.actor import Actor
-from enact_dist.actor.running.process import ActorThread
 from enact_dist.actor.triggers import BackOff
 from enact_dist.errors import MisuseError
-from enact_dist.outcome import Outcome
 from enact_dist.terms import (
     Aspect,
     Durability,

@@ -21,11 +21,9 @@ from once_robot import (
     write,
 )
 
-from enact_dist import testing
-from enact_dist.actor.running.process import ActorThread
+from enact_dist import ActorThread, Outcome, testing
 from enact_dist.actor.running.runner import run_actor
 from enact_dist.errors import LeaseLostError, LockTimeoutError
-from enact_dist.outcome import Outcome
 
 
 def taken_by(online, session, version=1):
@@ -144,8 +142,9 @@ PROGRAM = """
 import os, sys, threading
 from pathlib import Path
 sys.path.insert(0, sys.argv[3])
-from enact_dist import Actor, Aspect, Entity, View, World, Write, connect, run_actor
-from enact_dist.outcome import Outcome
+from enact_dist import Actor, Aspect, Entity, View, World, Write, connect
+from enact_dist.actor.running.runner import run_actor
+from enact_dist import Outcome
 
 class Robot(Actor):
     plan = View(World("online"), Entity("robot"), Aspect("plan", list))

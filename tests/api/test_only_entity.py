@@ -7,6 +7,7 @@ from polling import until
 
 from enact_dist import (
     Actor,
+    ActorThread,
     Aspect,
     Entities,
     Entity,
@@ -19,7 +20,7 @@ from enact_dist import (
 )
 from enact_dist.actor.binding import BoundActor
 from enact_dist.actor.check import check_actors
-from enact_dist.actor.running.process import ActorThread, actor_command
+from enact_dist.actor.running.process import actor_command
 from enact_dist.actor.uses import ActorDeclaration
 from enact_dist.errors import MisuseError
 

@@ -10,6 +10,7 @@ from polling import until
 
 from enact_dist import (
     Actor,
+    ActorThread,
     Aspect,
     Durability,
     Entities,
@@ -20,7 +21,6 @@ from enact_dist import (
     Write,
 )
 from enact_dist.actor.binding import BoundActor
-from enact_dist.actor.running.process import ActorThread
 from enact_dist.errors import LockTimeoutError, UnknownWorldError
 
 PATIENCE_S = 20.0

@@ -11,6 +11,7 @@ from enact_dist import (
     Entities,
     Entity,
     Lock,
+    Outcome,
     Read,
     ReadEach,
     Retention,
@@ -24,7 +25,6 @@ from enact_dist import (
 )
 from enact_dist.actor.running.step import Step
 from enact_dist.errors import ForgottenError, MisuseError, NullDatumError
-from enact_dist.outcome import Outcome
 
 LEVEL = Aspect("level_in_steps", float, compare=Tolerance(absolute=0.5))
 SUM = Aspect("sum_in_steps", float)

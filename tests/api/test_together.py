@@ -24,6 +24,7 @@ from together_parts import (
 )
 
 from enact_dist import (
+    ActorThread,
     Aspect,
     Durability,
     Entities,
@@ -41,7 +42,6 @@ from enact_dist.actor.actor import Actor
 from enact_dist.actor.binding import BoundActor
 from enact_dist.actor.check import check_cell
 from enact_dist.actor.inbox import SetInbox
-from enact_dist.actor.running.process import ActorThread
 from enact_dist.config.read import load_config
 from enact_dist.core.client.plan import Reading
 from enact_dist.core.protocol.datum import Datum, Position

@@ -14,6 +14,7 @@ from together_parts import (
 )
 
 from enact_dist import (
+    ActorThread,
     Aspect,
     Durability,
     Entity,
@@ -23,7 +24,6 @@ from enact_dist import (
     Write,
 )
 from enact_dist.actor.actor import Actor
-from enact_dist.actor.running.process import ActorThread
 
 pytestmark = pytest.mark.carrier("local", "drawn")
 TICKS = 12

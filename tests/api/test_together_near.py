@@ -4,11 +4,10 @@ import threading
 
 import pytest
 
-from enact_dist import testing
+from enact_dist import ActorThread, testing
 from enact_dist.access.lock import Lock
 from enact_dist.access.together import Together
 from enact_dist.actor.actor import Actor
-from enact_dist.actor.running.process import ActorThread
 from enact_dist.errors import MisuseError, NullDatumError
 from enact_dist.terms import Aspect, Entity, View, World, Write
 

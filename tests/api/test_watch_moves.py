@@ -6,8 +6,7 @@ import time
 import pytest
 from ports import free_endpoint
 
-from enact_dist import Actor, Lock, World, connect
-from enact_dist.actor.running.process import ActorThread
+from enact_dist import Actor, ActorThread, Lock, World, connect
 from enact_dist.core.protocol.messages import Pin, PlacementMap, ShardEntry
 from enact_dist.core.shard.state import ShardSettings
 from enact_dist.link.daemon.daemon import start_shard

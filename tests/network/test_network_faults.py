@@ -11,8 +11,8 @@ import pytest
 from network_site import LONG_S, SHARDS, TTL_S
 from polling import until
 
-from enact_dist import local
-from enact_dist.actor.running.process import ActorThread, actor_command
+from enact_dist import ActorThread, local
+from enact_dist.actor.running.process import actor_command
 from enact_dist.verify.chaos.network.switch import Cable
 from enact_dist.verify.daemons import COMMAND
 

@@ -12,11 +12,9 @@ from enact_dist import (
     Entities,
     Entity,
     Lock,
-    PastContext,
     Read,
     ReadEach,
     Tolerance,
-    Version,
     View,
     ViewEach,
     World,
@@ -24,7 +22,7 @@ from enact_dist import (
     WriteEach,
     connect,
 )
-from enact_dist.world.lineage import CauseTree
+from enact_dist.types import CauseTree, PastContext, Version
 
 
 @dataclass(frozen=True)

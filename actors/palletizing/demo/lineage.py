@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from enact_dist import Cell
-    from enact_dist.world.lineage import CauseTree, EffectTree
+    from enact_dist.types import CauseTree, EffectTree
 
 CAUSES_DEPTH: Final = 2
 """From the verdict over its depth frame and the model to the views."""

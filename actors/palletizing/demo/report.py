@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from actors.palletizing.simulation.packages import VERDICT_OF_KIND
 from actors.palletizing.vocabulary import place_entity
-from enact_dist.compare.diff import DiffKind
+from enact_dist.types import DiffKind
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from actors.palletizing.simulation.packages import Package
     from actors.palletizing.vocabulary import Deviation, Notice
-    from enact_dist.compare.diff import Diff
+    from enact_dist.types import Diff
 
 
 @dataclass(frozen=True, slots=True)

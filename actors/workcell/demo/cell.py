@@ -11,9 +11,8 @@ from actors import running_cell
 from actors.geometry.files import write_whole
 from actors.running_cell import DemoCell, placed, toml_of
 from actors.workcell.demo.options import Options
-from enact_dist import local
+from enact_dist import ActorThread, local
 from enact_dist.actor.running.load import configured_actor
-from enact_dist.actor.running.process import ActorThread
 from enact_dist.config.read import load_config
 from enact_dist.errors import ConfigError
 

@@ -36,9 +36,9 @@ if TYPE_CHECKING:
     from actors.running_cell import DemoCell
     from actors.workcell.demo.options import Options
     from actors.workcell.scenarios import Fault
-    from enact_dist import Aspect, Cell, Entity, Version
+    from enact_dist import Aspect, Cell, Entity
     from enact_dist.recording import RecordingSummary
-    from enact_dist.world.lineage import CauseTree
+    from enact_dist.types import CauseTree, Version
 
     Image = npt.NDArray[np.uint8]
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from actors.workcell.demo.conduct import Notes
     from enact_dist import Aspect, Cell, Entity
-    from enact_dist.world.lineage import CauseTree
+    from enact_dist.types import CauseTree
 
 T = TypeVar("T")
 

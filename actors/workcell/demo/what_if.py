@@ -11,8 +11,7 @@ from actors.workcell.demo.conduct import WHAT_IF, WHAT_IF_S
 from actors.workcell.motion import BRAKING_M_S2, CYCLE_S, NOMINAL_M_S
 from actors.workcell.planning import PathPlanning
 from actors.workcell.scores.trace import ONLINE
-from enact_dist import View
-from enact_dist.actor.running.process import ActorThread
+from enact_dist import ActorThread, View
 from enact_dist.errors import EnactError
 from enact_dist.recording import Replay
 
@@ -23,7 +22,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from actors.workcell.demo.conduct import Notes
-    from enact_dist import Cell, Version
+    from enact_dist import Cell
+    from enact_dist.types import Version
 
 T = TypeVar("T")
 

@@ -30,8 +30,15 @@ class ActorThread:
         with ActorThread(Fusion(), cell), ActorThread(Feedback(), cell):
             ...                                    # both run until the block ends
 
-    The arguments are those of `run_actor`; several threads may share a cell.  `on_error` is called
-    in the actor's thread.
+    Several threads may share a cell.
+
+    Args:
+        actor: The actor; a fresh instance, run once.
+        cell: Where its world contexts are.
+        worlds: Role → name of a world context; None binds each role to the context of its name.
+        name: Name in logs and reports; by default the class's, with that of its `only_entity`.
+        wait_s: How long an attempt waits for its lock; None: as long as the actor says.
+        on_error: Called in the actor's thread with each error, besides the log.
 
     Raises:
         MisuseError: The actor cannot be bound like this.

@@ -96,16 +96,7 @@ def run_actor(
     """Run an actor in this thread until `stop` is set, or until a once-actor is done.
 
     `stop` lets the update that is running finish and commit; an attempt that waits for its lock
-    ends within 0.2 s.
-
-    Args:
-        actor: The actor; a fresh instance, run once.
-        cell: Where its world contexts are.
-        worlds: Role → name of a world context; None binds each role to the context of its name.
-        stop: Set from another thread or a signal handler to end the run.
-        name: Name in logs and reports; by default the class's, with that of its `only_entity`.
-        wait_s: How long an attempt waits for its lock; None: as long as the actor says.
-        on_error: Called with each error, besides the log.
+    ends within 0.2 s.  The other arguments are those of `ActorThread`.
 
     Returns:
         What the actor did.

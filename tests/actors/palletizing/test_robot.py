@@ -31,9 +31,7 @@ from actors.palletizing.vocabulary import (
     GripCommand,
 )
 from actors.workcell.vocabulary import JOINTS
-from enact_dist import Lock, View, Write, local, testing
-from enact_dist.actor.running.process import ActorThread
-from enact_dist.outcome import Outcome
+from enact_dist import ActorThread, Lock, Outcome, View, Write, local, testing
 
 from .sound_nets import axes, net, primitive, way
 from .spring_arm import ARM, HOME_RAD, SpringArm

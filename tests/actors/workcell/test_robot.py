@@ -13,8 +13,7 @@ from actors.workcell.motion import CommandedArm
 from actors.workcell.robot import Robot, RobotJoints
 from actors.workcell.simulation.arm import ARM, HOME_RAD
 from actors.workcell.vocabulary import EXECUTION, JOINTS, MODEL, PATH, ROBOT, SPEED, Path, Speed
-from enact_dist import Lock, View, Write, local, testing
-from enact_dist.actor.running.process import ActorThread
+from enact_dist import ActorThread, Lock, View, Write, local, testing
 
 MS = 1_000_000
 AWAY = np.array(HOME_RAD) + np.array([2.5, 0, 0, 0, 0, 0, 0])

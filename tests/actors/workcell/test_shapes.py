@@ -10,7 +10,8 @@ from actors.workcell.simulation.room import BOXES
 from actors.workcell.simulation.scan import scan_of_room
 from actors.workcell.vocabulary import BOXES as BOXES_ASPECT
 from actors.workcell.vocabulary import GRID, OBSTACLES, SURFACE, WORKSPACE, Grid, obstacle_entity
-from enact_dist import ViewEach, local, run_actor
+from enact_dist import ViewEach, local
+from enact_dist.actor.running.runner import run_actor
 
 LOW, HIGH = np.array((-3.4, -3.4, 0.0)), np.array((3.4, 3.4, 2.6))
 SMALL = Camera(width_px=192, height_px=144, fx_px=173.0, fy_px=173.0, cx_px=95.5, cy_px=71.5)
