@@ -238,7 +238,7 @@ STANDING: Final = Aspect(
         }
     ),
 )
-"""Expected content (place/*, both): ``training.diff(online, PLACES, [STANDING])`` names the
+"""Expected content (place/*, both): ``training.diff(online, PLACES, STANDING)`` names the
 deviations.
 """
 DEVIATIONS: Final = Aspect("deviation", dict[str, Deviation])

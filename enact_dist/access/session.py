@@ -202,6 +202,17 @@ class Session:
                 return
         client.greet()
 
+    def registered(self, *, enough: str = "") -> dict[str, AspectEntry]:
+        """Return the registered aspects by name, as the shards know them now.
+
+        Once a shard that answers knows an aspect that is `enough`, no other shard is awaited.
+
+        Raises:
+            ShardUnreachableError: A shard does not answer.
+        """
+        self.greet(enough=enough)
+        return self.client.aspect_entries()
+
     def look_up(self, aspects: Iterable[Aspect[Any]], *, timeout_s: float | None = None) -> None:
         """Make sure that no shard knows one of these aspects, which are only read, otherwise.
 

@@ -41,11 +41,29 @@ VIEWS_MAX = 3
 """Retries of a view whose data were removed before they were fetched."""
 
 
-def take_snapshot(
-    asked: tuple[LockRequest[Any] | Together[Any], ...], *, register: bool = True
-) -> Snapshot:
-    """Take a view of the requested data; large data are fetched before this returns."""
+def take_snapshot(asked: tuple[LockRequest[Any] | Together[Any], ...]) -> Snapshot:
+    """Take a view of the requested data, and keep it with what was requested."""
     together, requests = _spread(asked)
+    readings, captured_ns = take_view(requests, together)
+    return Snapshot(readings, requests, captured_ns)
+
+
+def take_view(
+    requests: tuple[LockRequest[Any], ...],
+    together: Together[Any] | None = None,
+    *,
+    register: bool = True,
+) -> tuple[Readings, int]:
+    """Take a view of the requested data; large data are fetched before this returns.
+
+    Args:
+        requests: What to view, with the requests of a set.
+        together: The set.
+        register: Whether the aspects are checked, and registered where they are new.
+
+    Returns:
+        The data, and the capture stamp of the set.
+    """
     if not requests:
         raise MisuseError("a view of nothing: name at least one View or ViewEach")
     if len(requests) > ITEMS_MAX:
@@ -68,14 +86,20 @@ def take_snapshot(
             readings = take_readings(session, items, past_ns=moment.at_ns)
             if register:
                 session.check_shown(readings.readings(), requests, prepared)
-            snapshot = Snapshot(readings, requests, together, captured_ns)
-            if together is None or attempt == VIEWS_MAX or snapshot.has_set():
-                return snapshot  # what has left retention just now is null in it
+            if attempt == VIEWS_MAX or together is None or _has_set(readings, together):
+                return readings, captured_ns  # what has left retention just now is null in it
         except LeaseLostError:
             # A shard restarted, or the session rested too long, between the view and its data.
             if attempt == VIEWS_MAX:
                 raise
     raise AssertionError("a view ends in its data or an error")
+
+
+def _has_set(readings: Readings, together: Together[Any]) -> bool:
+    """Whether a set has as many data as it requires."""
+    states = [readings.state(slot_of(view)) for view in together.requests]
+    there = sum(state is not None and not state.null_reason for state in states)
+    return there >= together.least
 
 
 def _moment_of(requests: tuple[LockRequest[Any], ...], together: Together[Any] | None) -> Moment:
@@ -286,21 +310,11 @@ class Snapshot:
         self,
         readings: Readings,
         requests: tuple[LockRequest[Any], ...],
-        together: Together[Any] | None = None,
         captured_ns: int = 0,
     ) -> None:
         self._readings = readings
         self._requests = {request: request for request in requests}
-        self._together = together
         self.captured_ns = captured_ns
-
-    def has_set(self) -> bool:
-        """Whether the `Together` has as many data as it requires."""
-        if self._together is None:
-            return True
-        states = [self._readings.state(slot_of(view)) for view in self._together.requests]
-        there = sum(state is not None and not state.null_reason for state in states)
-        return there >= self._together.least
 
     @overload
     def __getitem__(self, request: Together[T]) -> tuple[T, ...]: ...
@@ -334,28 +348,11 @@ class Snapshot:
         except NullDatumError:
             return default
 
-    def state(self, request: LockRequestOne[Any]) -> SlotState | None:
-        """Return the state that was shown of a slot; as `version`, for the framework."""
-        check_requested(request, self._requests, "view")
-        return self._readings.state(slot_of(request))
-
     def version(self, request: LockRequestOne[Any]) -> int:
         """Return the version of the viewed datum (0: never set)."""
-        state = self.state(request)
-        return state.version if state is not None else 0
-
-    def encoded(self, request: LockRequest[Any]) -> Any:
-        """Return the encoded datum of one request.
-
-        Raises:
-            NullDatumError: The world context does not know it.
-        """
         check_requested(request, self._requests, "view")
-        slot = slot_of(request)
-        state = self._readings.state(slot)
-        if state is None or state.null_reason:
-            raise self._readings.null_error(slot)
-        return self._readings.datum(slot)
+        state = self._readings.state(slot_of(request))
+        return state.version if state is not None else 0
 
     def __repr__(self) -> str:
         return f"Snapshot({', '.join(map(repr, self._requests))})"
@@ -371,4 +368,9 @@ def untyped_datum(context: Context, session: Session, entity: Entity, aspect: st
     if aspect not in known:
         raise unknown_aspect(aspect, known)
     request = View(context, entity, Aspect(aspect, object))
-    return decode_untyped(take_snapshot((request,), register=False).encoded(request))
+    readings, _ = take_view((request,), register=False)
+    slot = slot_of(request)
+    state = readings.state(slot)
+    if state is None or state.null_reason:
+        raise readings.null_error(slot)
+    return decode_untyped(readings.datum(slot))

@@ -24,6 +24,7 @@ from enact_dist.errors import LinkError
 from enact_dist.link.clock import monotonic_ns
 from enact_dist.patterns import pattern_matches
 from enact_dist.terms import Entity, View
+from enact_dist.world.context import watch_patterns
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
@@ -326,8 +327,8 @@ class _Follower:
     def _opened(self) -> Watch:
         patterns = dict.fromkeys(str(watched.entities) for watched in self._watched)
         aspects = {aspect.name: aspect for watched in self._watched for aspect in watched.aspects}
-        data = self._bound.views_one_set
-        return self._watched[0].context.watch_all(patterns, aspects.values(), data=data)
+        context, data = self._watched[0].context, self._bound.views_one_set
+        return watch_patterns(context, patterns, aspects.values(), data=data)
 
     def _note(self, change: Change) -> None:
         if not self._bound.covers(change.entity):

@@ -30,6 +30,7 @@ import msgpack
 
 from enact_dist.core.protocol.messages import REPORT_BYTES_MAX
 from enact_dist.errors import CommitUnknownError, ProtocolError
+from enact_dist.world.cell import session_behind
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Mapping
@@ -328,7 +329,8 @@ class ReportBoard:
         """Replace the report of one actor, and report all."""
         with self._guard:
             self._posted[statistics.name] = statistics
-            cell.set_report(encode_reports(list(self._posted.values())))
+            client = session_behind(cell).client
+            client.set_report(encode_reports(list(self._posted.values())))
 
 
 def percentile(ascending: list[int], part: float) -> int:

@@ -267,6 +267,7 @@ def _item(cell: Cell, request: tuple[str, str, str, str], default: str | None) -
     """Return the protocol's line for a request, whose datum type is of no matter here."""
     from enact_dist.access.session import unknown_aspect
     from enact_dist.core.protocol.messages import Item
+    from enact_dist.world.cell import session_behind
 
     world, entity, aspect, access = request
     world = world or default or ""
@@ -278,7 +279,8 @@ def _item(cell: Cell, request: tuple[str, str, str, str], default: str | None) -
             f"in which world context is {entity}/{aspect}? write WORLD:{entity}/{aspect}:{access}"
             f" or --world WORLD (known: {', '.join(worlds) or 'none'})"
         )
-    known = [name for name, entry in cell.aspects(enough=aspect).items() if entry[0]]
+    entries = session_behind(cell).registered(enough=aspect)
+    known = [name for name, entry in entries.items() if entry.fingerprint]
     if aspect not in known:
         raise unknown_aspect(aspect, known)
     cell.world(world)  # refuses an unknown one by name

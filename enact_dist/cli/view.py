@@ -90,6 +90,7 @@ def run_view(options: argparse.Namespace) -> int:
     """Serve pages until a signal."""
     from enact_dist.view.pages.server import ViewServer, load_viser
     from enact_dist.view.pages.viewer import Viewer
+    from enact_dist.world.look import look_at
 
     load_viser()
     with ExitStack() as stack:
@@ -102,7 +103,7 @@ def run_view(options: argparse.Namespace) -> int:
         else:
             options.cell = cell_target(options)
             shown = stack.enter_context(open_cell(options, actor="view"))
-            shown.look()  # without the right `observe` it ends here, by its name
+            look_at(shown)  # without the right `observe` it ends here, by its name
         viewer = stack.enter_context(Viewer(shown, _settings(options)))
         token = os.environ.get(TOKEN_VARIABLE)
         server = stack.enter_context(

@@ -132,15 +132,14 @@ def diff(
     left: Viewable,
     right: Viewable,
     entities: Entities | Entity | str = "**",
-    aspects: Iterable[Aspect[Any] | str] | None = None,
+    aspects: Sequence[Aspect[Any] | str] = (),
 ) -> Diff:
     """Compare two world contexts; see `WorldContext.diff`."""
-    call = "diff(other, entities, aspects)"
+    call = "diff(other, entities, *aspects)"
     check_viewable(call, right)
     check_pattern(call, "entities", entities)
-    if aspects is not None:
-        aspects = checked_each(call, "aspects", aspects, Aspect, str)
-    types = aspects_of((left, right), aspects)
+    checked_each(call, "aspects", aspects, Aspect, str)
+    types = aspects_of((left, right), aspects or None)
     places = [(str(Entities(str(entities))), name) for name in types]
     return diff_places(left, right, places, types, each=True)
 

@@ -27,6 +27,7 @@ from enact_dist.operate.cell_rows import (
     ShardRates,
 )
 from enact_dist.patterns import pattern_matches
+from enact_dist.world.look import look_at
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -69,7 +70,7 @@ class CellLooks:
     def take(self, *, slots: bool = False) -> CellRates:
         """Take a look, at the slots if they are due or asked for; return the rates since then."""
         due = slots or time.monotonic() >= self._slots_due_s
-        look = self._cell.look(self._survey if due else None)
+        look = look_at(self._cell, self._survey if due else None)
         if due:
             wait_s = look.slots_took_s / SHARE_OF_TIME
             self._slots_due_s = time.monotonic() + wait_s

@@ -199,6 +199,7 @@ def _cell(
 ) -> Generator[Finding, None, frozenset[str]]:
     """Check the cell; return the names of the shards that keep data in a folder now."""
     from enact_dist.world.connecting import connect
+    from enact_dist.world.look import welcomes
 
     kept: frozenset[str] = frozenset()
     try:
@@ -207,9 +208,9 @@ def _cell(
             kept = frozenset(one.name for one in shards if one.reachable and is_kept(one.epoch))
             for shard in shards:
                 yield from _shard(shard)
-            welcomes = cell.welcomes()
-            yield from duplicate_daemons(cell.name, config, welcomes)
-            yield from differences(config, shards, welcomes)
+            answers = welcomes(cell)
+            yield from duplicate_daemons(cell.name, config, answers)
+            yield from differences(config, shards, answers)
     except ShardUnreachableError as error:
         if config is None:
             yield _unreachable("cell", target)

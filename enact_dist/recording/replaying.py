@@ -20,6 +20,7 @@ from enact_dist.recording.other_writers import OtherWriters
 from enact_dist.recording.reading import RecordedCommit, Recording
 from enact_dist.terms import Entities, checked_name
 from enact_dist.wire.limits import BODY_BYTES_MAX, ITEMS_MAX
+from enact_dist.world.cell import session_behind
 from enact_dist.world.version_data import set_encoded
 
 if TYPE_CHECKING:
@@ -314,17 +315,17 @@ class Replay:
         for name in sorted(self._worlds.get(name, name) for name in names):
             if name in there and name not in self._sessions:  # a second run has data of the first
                 self._refuse_data(self._cell.world(name))
-        types = self._cell.aspects()
+        types = session_behind(self._cell).registered()
         for name, facts in aspects.items():
             if name not in types or (self._aspects and name not in self._aspects):
                 continue
             # Data of an older type are read with the defaults, whatever was written before.
             wanted = AspectEntry(name, facts.fingerprint, "", reads=True)
-            if type_conflict(AspectEntry(name, *types[name]), wanted):
+            if type_conflict(types[name], wanted):
                 raise DatumTypeError(
                     f"aspect {name!r} is {facts.fingerprint} in {self.recording.path} and"
-                    f" {types[name][0]} in cell {self._cell.name!r}: no program there could read"
-                    " what a replay sets"
+                    f" {types[name].fingerprint} in cell {self._cell.name!r}: no program there"
+                    " could read what a replay sets"
                 )
         return names
 

@@ -18,6 +18,7 @@ from enact_dist.errors import EnactError
 from enact_dist.operate.cell_rates import Looks, pause_s
 from enact_dist.view import markup
 from enact_dist.view.follower import Follower
+from enact_dist.world.look import look_at
 from enact_dist.world.trees import shown_s
 
 if TYPE_CHECKING:
@@ -121,7 +122,7 @@ class Activity(Follower):
         self._types = {name: type_name(one.fingerprint) for name, one in aspects.items()}
 
     def _ask(self) -> None:
-        rates = self._looks.add(self._source.cell.look())
+        rates = self._looks.add(look_at(self._source.cell))
         self._run_times.add(rates.actors)
         self.now = CellActivity(
             table(rates, "l"),

@@ -27,6 +27,7 @@ from enact_dist.errors import (
 from enact_dist.link.client.calls import CALL_S
 from enact_dist.recording.exact import Recorded
 from enact_dist.terms import Access
+from enact_dist.world.cell import session_behind
 from enact_dist.world.version_data import Wanted, found_of
 
 if TYPE_CHECKING:
@@ -101,7 +102,7 @@ class CellSource:
 
     def __init__(self, cell: Cell) -> None:
         self.cell = cell
-        self.session = cell._session  # noqa: SLF001 - a handle of a world context asks all shards
+        self.session = session_behind(cell)
         self._away: dict[str, tuple[float, str]] = {}
 
     def of_page(self) -> CellSource:

@@ -26,8 +26,6 @@ from enact_dist.core.protocol.messages import (
     ListSessions,
     Locks,
     Sessions,
-    Survey,
-    Welcome,
 )
 from enact_dist.errors import EnactError, MisuseError
 from enact_dist.link.client.dropped import when_dropped
@@ -49,11 +47,9 @@ from enact_dist.world.listings import (
     lock_info,
     lock_infos,
     refusal_infos,
-    sessions_named,
     settle_alarms,
     shard_info,
 )
-from enact_dist.world.look import Look, look_at
 from enact_dist.world.pins import pin_versions, pinned_versions, unpin_versions
 
 if TYPE_CHECKING:
@@ -84,7 +80,7 @@ class Cell(FormerNames, Closing):
         "keep": "pin",
         "kept": "pinned",
         "let_go": "unpin",
-        "namesakes": "sessions_named",
+        "aspect_infos": "aspects",
         "settle_alarms": "acknowledge_alarms",
     }
 
@@ -408,20 +404,6 @@ class Cell(FormerNames, Closing):
         """Return every shard of the cell; of an unreachable one with the reason if it is known."""
         return tuple(shard_info(self._client, shard) for shard in self._client.shards())
 
-    def look(self, slots: Survey | None = None) -> Look:
-        """Return what all shards that answer tell of the cell now, `slots` too if they are asked.
-
-        A shard that does not answer is one that is not `reachable`; no error is raised for it.
-        """
-        return look_at(self._client, slots)
-
-    def welcomes(self) -> dict[str, Welcome]:
-        """Return how each shard that answers at once describes the cell: placement, contexts."""
-        client, names = self._client, self._client.shards()
-        answers = client.call_once([(name, client.core.hello(name)) for name in names])
-        pairs = zip(names, answers, strict=True)
-        return {name: answer for name, answer in pairs if isinstance(answer, Welcome)}
-
     def actors(self) -> tuple[ActorInfo, ...]:
         """Return the sessions of named actors over all shards.
 
@@ -435,33 +417,10 @@ class Cell(FormerNames, Closing):
         """Identity of this process's session, as `ActorInfo.session` names it."""
         return self._client.core.session
 
-    def sessions_named(self, name: str) -> tuple[ActorInfo, ...]:
-        """Return the other sessions of actors of a name that are not silent.
-
-        All shards are asked, because the other may be known to one of them alone; none is waited
-        for longer than one call.
-        """
-        return sessions_named(self._client, name)
-
-    def set_report(self, report: bytes) -> None:
-        """Send an actor's statistics with the keep-alives: msgpack of a map, up to 4 KiB."""
-        self._client.set_report(report)
-
-    def aspects(self, *, enough: str = "") -> dict[str, tuple[str, str]]:
-        """Return the registered aspects: name to (fingerprint of the type, durability).
-
-        Args:
-            enough: Once a shard that answers knows an aspect of this name, no other is awaited.
-
-        Raises:
-            ShardUnreachableError: A shard does not answer.
-        """
-        self._session.greet(enough=enough)
-        entries = self._client.aspect_entries()
-        return {name: (entry.fingerprint, entry.durability) for name, entry in entries.items()}
-
-    def aspect_infos(self, world: str = "") -> tuple[AspectInfo, ...]:
+    def aspects(self, world: str = "") -> tuple[AspectInfo, ...]:
         """Return the registered aspects, and how many data they have in one world context, or all.
+
+        Where shards know an aspect differently, each way has its own entry.
 
         Raises:
             ShardUnreachableError: A shard does not answer.
@@ -487,6 +446,11 @@ class Cell(FormerNames, Closing):
 
     def __repr__(self) -> str:
         return f"<cell {self.name!r}, {len(self._client.shards())} shards>"
+
+
+def session_behind(cell: Cell) -> Session:
+    """Return the session of a cell, for what only the framework asks of it."""
+    return cell._session  # noqa: SLF001 - of this module
 
 
 def _close_all() -> None:

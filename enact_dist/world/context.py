@@ -29,7 +29,13 @@ from enact_dist.access.arguments import (
 from enact_dist.access.asking import listed
 from enact_dist.access.lock import Lock, refuse_inside_lock
 from enact_dist.access.reads import null_error
-from enact_dist.access.snapshot import Snapshot, reason_of, take_snapshot, untyped_datum
+from enact_dist.access.snapshot import (
+    Snapshot,
+    reason_of,
+    take_snapshot,
+    take_view,
+    untyped_datum,
+)
 from enact_dist.access.watch import Change, Watch
 from enact_dist.core.protocol.datum import Position, Slot
 from enact_dist.errors import ForgottenError, MisuseError, NullDatumError
@@ -117,44 +123,13 @@ class WorldContext(CellContext):
         refuse_inside_lock("watch")
         check_pattern("watch(entities, *aspects)", "entities", entities)
         checked_each("watch(entities, *aspects)", "aspects", aspects, Aspect)
-        return self.watch_all((str(entities),), aspects, data=data)
-
-    def watch_all(
-        self, patterns: Iterable[str], aspects: Iterable[Aspect[Any]], *, data: bool = False
-    ) -> Watch:
-        """Follow several patterns with one watch; as `watch`, for the framework."""
-        self.session.client.check_usable()
-        aspects = tuple(aspects)
-        if aspects:
-            self.session.look_up(aspects)
-        names = tuple(aspect.name for aspect in aspects)
-        known = {aspect.name: aspect for aspect in aspects}
-        read = partial(self._value_of, known) if data else None
-        return Watch(self.session.client, (self.name,), tuple(patterns), names, read=read)
-
-    def _value_of(self, aspects: Mapping[str, Aspect[Any]], change: Change) -> Any:
-        """Return the datum that a change brought, or else the newest; see `Watch.value`."""
-        refuse_inside_lock("value")
-        aspect, session = aspects.get(change.aspect), self.session
-        if change.carried is not None:
-            datum = at_hand(session.client, session.cache, change.carried)
-            if datum is not None and aspect is not None:
-                return decode_datum(datum, aspect.datum_type)
-            if datum is not None:
-                return decode_untyped(datum)
-        try:
-            if aspect is None:
-                return untyped_datum(self, session, change.entity, change.aspect)
-            request = View(self, change.entity, aspect)
-            return self.view(request)[request]
-        except NullDatumError:  # deleted meanwhile
-            return None
+        return watch_patterns(self, (str(entities),), aspects, data=data)
 
     def watch_diff(
         self,
         other: Viewable,
         entities: Entities | Entity | str = "**",
-        *aspects: Aspect[Any],
+        *aspects: Aspect[Any] | str,
     ) -> DiffWatch:
         """Follow where this world context and another one of the cell differ: a continuous diff.
 
@@ -164,7 +139,7 @@ class WorldContext(CellContext):
         Args:
             other: A world context of the same connection; also a past one, as a reference.
             entities: A pattern or one entity.
-            aspects: Which aspects; none means all.
+            aspects: Which aspects, or their names; none means all.
 
         Raises:
             LockHeldError: This thread holds a lock.
@@ -295,6 +270,42 @@ class WorldContext(CellContext):
         return (entry.source, entry.at_ns) if entry is not None and entry.source else None
 
 
+def watch_patterns(
+    context: WorldContext,
+    patterns: Iterable[str],
+    aspects: Iterable[Aspect[Any]],
+    *,
+    data: bool = False,
+) -> Watch:
+    """Follow several patterns with one watch; see `WorldContext.watch`."""
+    session = context.session
+    session.client.check_usable()
+    known = {aspect.name: aspect for aspect in aspects}
+    if known:
+        session.look_up(known.values())
+    read = partial(_value_of, context, known) if data else None
+    return Watch(session.client, (context.name,), tuple(patterns), tuple(known), read=read)
+
+
+def _value_of(context: WorldContext, aspects: Mapping[str, Aspect[Any]], change: Change) -> Any:
+    """Return the datum that a change brought, or else the newest; see `Watch.value`."""
+    refuse_inside_lock("value")
+    aspect, session = aspects.get(change.aspect), context.session
+    if change.carried is not None:
+        datum = at_hand(session.client, session.cache, change.carried)
+        if datum is not None and aspect is not None:
+            return decode_datum(datum, aspect.datum_type)
+        if datum is not None:
+            return decode_untyped(datum)
+    try:
+        if aspect is None:
+            return untyped_datum(context, session, change.entity, change.aspect)
+        request = View(context, change.entity, aspect)
+        return context.view(request)[request]
+    except NullDatumError:  # deleted meanwhile
+        return None
+
+
 @dataclass(frozen=True, slots=True)
 class Version(FormerNames, Generic[T]):
     """One version of a datum, without it.
@@ -364,8 +375,8 @@ class Version(FormerNames, Generic[T]):
         past = PastContext(self.world.name, self.world.session, Moment(self.position.stamp_ns))
         request = View(past, self.entity, self.aspect)
         untyped = self.aspect.datum_type is object
-        snapshot = take_snapshot((request,), register=not untyped)
-        state = snapshot.state(request)
+        readings, _ = take_view((request,), register=not untyped)
+        state = readings.state(self.slot)
         shown = (state.version, state.stamp_ns) if state is not None else (0, 0)
         if shown != (self.version, self.position.stamp_ns):
             raise ForgottenError(
@@ -375,7 +386,10 @@ class Version(FormerNames, Generic[T]):
             )
         if self.null_reason:
             raise null_error(self.slot, state)
-        datum: Any = decode_untyped(snapshot.encoded(request)) if untyped else snapshot[request]
+        slot, aspect = self.slot, self.aspect
+        datum: Any = (
+            decode_untyped(readings.datum(slot)) if untyped else readings.value(slot, aspect)
+        )
         return datum  # type: ignore[no-any-return]  # of the aspect's type, or the aspect has none
 
     def __repr__(self) -> str:

@@ -20,8 +20,10 @@ from enact_dist.core.protocol.messages import (
     Sessions,
     Survey,
     Surveyed,
+    Welcome,
 )
 from enact_dist.errors import LinkError
+from enact_dist.world.cell import session_behind
 from enact_dist.world.listings import (
     ActorInfo,
     LockInfo,
@@ -40,6 +42,7 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.datum import Slot
     from enact_dist.core.protocol.messages import Answer, Request
     from enact_dist.link.client.locks import CellClient
+    from enact_dist.world.cell import Cell
 
     Call = tuple[str, Request]
 
@@ -69,8 +72,12 @@ class Look:
     slots_took_s: float = 0.0
 
 
-def look_at(client: CellClient, slots: Survey | None) -> Look:
-    """Take a look at a cell; see `Cell.look`."""
+def look_at(cell: Cell, slots: Survey | None = None) -> Look:
+    """Return what all shards that answer tell of a cell now, `slots` too if they are asked.
+
+    A shard that does not answer is one that is not `reachable`; no error is raised for it.
+    """
+    client = session_behind(cell).client
     client.check_usable()
     started_s, unix_s, problems = time.monotonic(), time.time(), dict[str, str]()
     shards = client.shards()
@@ -102,6 +109,15 @@ def look_at(client: CellClient, slots: Survey | None) -> Look:
         None,
     )
     return look if slots is None else _with_slots(client, look, slots, list(infos))
+
+
+def welcomes(cell: Cell) -> dict[str, Welcome]:
+    """Return how each shard that answers at once describes the cell: placement, contexts."""
+    client = session_behind(cell).client
+    names = client.shards()
+    answers = client.call_once([(name, client.core.hello(name)) for name in names])
+    pairs = zip(names, answers, strict=True)
+    return {name: answer for name, answer in pairs if isinstance(answer, Welcome)}
 
 
 def _with_slots(client: CellClient, look: Look, survey: Survey, shards: Sequence[str]) -> Look:

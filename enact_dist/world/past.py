@@ -92,7 +92,7 @@ class CellContext(FormerNames, Context):
         self,
         other: Viewable,
         entities: Entities | Entity | str = "**",
-        aspects: Iterable[Aspect[Any] | str] | None = None,
+        *aspects: Aspect[Any] | str,
     ) -> Diff:
         """Compare this world context (left) with another one (right), datum by datum.
 
@@ -105,7 +105,7 @@ class CellContext(FormerNames, Context):
             other: A present or past world context.  If it is of another cell, it is read in a
                 snapshot of its own.
             entities: A pattern or one entity.
-            aspects: Aspects, or their names; None means all.
+            aspects: Which aspects, or their names; none means all.
 
         Raises:
             LockHeldError: This thread holds a lock.

@@ -27,6 +27,7 @@ from enact_dist.errors import (
 )
 from enact_dist.terms import Aspect, Entities, Entity, View, World, Write
 from enact_dist.world.connecting import local
+from enact_dist.world.context import watch_patterns
 from enact_dist.world.listings import unpacked_report
 
 if TYPE_CHECKING:
@@ -257,30 +258,20 @@ def test_actor_that_runs_once_tries_again_when_it_was_refused(cell):
     assert (found.updates, found.refused, found.state) == (1, 2, "done")
 
 
-class FlakyContext:
-    """Stands for a world context whose shard is away at the first look."""
-
-    name = "online"
-
-    def __init__(self, context, failures: int) -> None:
-        self.context = context
-        self.failures = failures
-
-    def watch_all(self, *args, **options):
-        """Watch, or fail as long as failures are left."""
-        if self.failures:
-            self.failures -= 1
-            raise ShardUnreachableError("shard left did not answer")
-        return self.context.watch_all(*args, **options)
-
-
 @pytest.mark.parametrize("own", [False, True])
-def test_watching_opens_a_watch_again_when_its_shard_was_away(cell, caplog, own):
+def test_watching_opens_a_watch_again_when_its_shard_was_away(cell, caplog, monkeypatch, own):
     """No change is lost: the watch that opens at last begins with what is there."""
+    answers = iter((False, False, True))
+
+    def flaky(*args, **options):
+        if not next(answers):
+            raise ShardUnreachableError("shard left did not answer")
+        return watch_patterns(*args, **options)
+
+    monkeypatch.setattr("enact_dist.actor.inbox.watch_patterns", flaky)
     caplog.set_level(logging.CRITICAL, logger="enact.actor")
     write(cell, A, 1)
     bound = BoundActor(Reconstruction(), cell)
-    bound.contexts["online"] = FlakyContext(cell.world("online"), failures=2)
     inbox = Inbox(per_entity=True)
 
     with Watching(bound, inbox, own=own) as changes:

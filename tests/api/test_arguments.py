@@ -36,24 +36,20 @@ CALLS = {
     ),
     "diff with a name": (
         lambda world, _: world.diff("online"),
-        "diff(other, entities, aspects): other is 'online', which is no world context of a cell",
+        "diff(other, entities, *aspects): other is 'online', which is no world context of a cell",
         "cell.world(name)",
     ),
     "diff with a role": (
         lambda world, _: world.diff(World("online")),
         "other is World('online'), which is no world context of a cell",
     ),
-    "diff by one aspect": (
-        lambda world, _: world.diff(world, "robot", PLAN),
-        "diff(other, entities, aspects): aspects is Aspect(",
-        "which is no list of Aspect or str",
-    ),
-    "diff by one name": (
-        lambda world, past: past.diff(world, "robot", "plan"),
-        "diff(other, entities, aspects): aspects is 'plan', which is no list of Aspect or str",
+    "diff by a list": (
+        lambda world, past: past.diff(world, "robot", [PLAN]),
+        "diff(other, entities, *aspects): one of aspects is [Aspect(",
+        "which is no Aspect or str",
     ),
     "diff of numbers": (
-        lambda world, _: world.diff(world, "robot", [3]),
+        lambda world, _: world.diff(world, "robot", 3),
         "one of aspects is 3, which is no Aspect or str",
     ),
     "watch_diff with a name": (

@@ -97,12 +97,12 @@ def test_tolerance_of_the_aspect_decides(training, online):
     put(training, bench, SEEN, Seen("box", 1))
     put(online, bench, SEEN, Seen("box", 2))
 
-    diff = training.diff(online, aspects=[SHIFT, SEEN])
+    diff = training.diff(online, "**", SHIFT, SEEN)
 
     assert not diff
     assert (diff.equal, diff.within) == (1, 1)
     put(online, piece, SHIFT, 1.75)
-    (row,) = training.diff(online, aspects=[SHIFT, SEEN])
+    (row,) = training.diff(online, "**", SHIFT, SEEN)
     assert (row.difference.distance, row.difference.unit, row.difference.tolerance) == (
         0.75,
         "mm",
@@ -115,8 +115,8 @@ def test_entities_and_aspects_limit_a_diff(training, online):
     for entity in (piece, tray):
         put(online, entity, COUNT, 1)
         put(online, entity, NAME, "x")
-    assert shown(training.diff(online, "tray/*", [COUNT])) == [("tray/1", "count", "only right")]
-    assert shown(training.diff(online, piece, ["name"])) == [("piece", "name", "only right")]
+    assert shown(training.diff(online, "tray/*", COUNT)) == [("tray/1", "count", "only right")]
+    assert shown(training.diff(online, piece, "name")) == [("piece", "name", "only right")]
 
 
 def test_deleted_data_are_no_data(training, online):
@@ -155,7 +155,7 @@ def test_large_arrays_are_compared_where_they_differ(training, online):
     array = array.copy()
     array[17, 3] = 4.0
     put(online, piece, LARGE, array)
-    (row,) = training.diff(online, aspects=[LARGE])
+    (row,) = training.diff(online, "**", LARGE)
     assert (row.difference.where, row.difference.distance) == ("[17, 3]", 4.0)
 
 
@@ -204,7 +204,7 @@ def test_own_comparator_is_asked_with_data_of_its_type(training, online):
     own = Aspect("seen", Seen, compare=labels)
     put(training, piece, own, Seen("box", 1))
     put(online, piece, own, Seen("can", 1))
-    (row,) = training.diff(online, aspects=[own])
+    (row,) = training.diff(online, "**", own)
     assert asked == [(Seen("box", 1), Seen("can", 1))]
     assert row.difference.unit == "labels"
 
@@ -219,7 +219,7 @@ def test_error_of_a_comparator_names_its_data(training, online):
     put(training, piece, own, 1)
     put(online, piece, own, 2)
     with pytest.raises(ZeroDivisionError) as caught:
-        training.diff(online, aspects=[own])
+        training.diff(online, "**", own)
     assert "piece/count" in caught.value.__notes__[0]
 
 
@@ -229,11 +229,11 @@ def test_unknown_aspect_and_another_type_are_refused(training, online):
     with pytest.raises(
         MisuseError, match=r"'cuont' is registered; did you mean 'count'\? \(known: count\)"
     ):
-        training.diff(online, aspects=["cuont"])
+        training.diff(online, "**", "cuont")
     with pytest.raises(MisuseError, match="no aspect 'cuont'"):
-        training.diff(online, aspects=[Aspect("cuont", object)])
+        training.diff(online, "**", Aspect("cuont", object))
     with pytest.raises(DatumTypeError):
-        training.diff(online, aspects=[Aspect("count", str)])
+        training.diff(online, "**", Aspect("count", str))
 
 
 def test_diff_inside_a_lock_is_refused(training, online):
@@ -284,7 +284,7 @@ def test_diff_shows_no_commit_half(training, online):
     writer = threading.Thread(target=write)
     writer.start()
     try:
-        found = [training.diff(online, piece, [COUNT]) for _ in range(50)]
+        found = [training.diff(online, piece, COUNT) for _ in range(50)]
     finally:
         stop.set()
         writer.join()

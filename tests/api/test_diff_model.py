@@ -76,7 +76,7 @@ class Diffs(RuleBasedStateMachine):
     def compare(self, which):
         left = sorted(self.model)[which % len(self.model)]
         for right in self.model:
-            diff = self.cell.world(left).diff(self.cell.world(right), aspects=[SHIFT, NAME])
+            diff = self.cell.world(left).diff(self.cell.world(right), "**", SHIFT, NAME)
 
             found = {(row.entity.name, row.aspect): row.kind.value for row in diff}
             assert found == model_diff(self.model[left], self.model[right])

@@ -84,7 +84,7 @@ def test_diff_after_a_restart_takes_a_new_look(cell, restart, monkeypatch):
         return fetch(self, readings)
 
     monkeypatch.setattr(SideView, "fetch", fetch_late)
-    (row,) = training.diff(online, aspects=[large])
+    (row,) = training.diff(online, "**", large)
     assert row.difference.distance == 3.0
     assert len(restarts) == 1
 

@@ -187,8 +187,8 @@ def test_other_former_names_warn_and_work(cell, online):
     (version,) = online.history(ARM, COUNT)
     with pytest.warns(DeprecationWarning, match=r"Version\.kept is now Version\.pinned"):
         assert version.kept == ()
-    with pytest.warns(DeprecationWarning, match=r"Cell\.namesakes is now Cell\.sessions_named"):
-        assert cell.namesakes("nobody") == cell.sessions_named("nobody")
+    with pytest.warns(DeprecationWarning, match=r"Cell\.aspect_infos is now Cell\.aspects"):
+        assert cell.aspect_infos("online") == cell.aspects("online")
     for one in (cell, online, version):
         with pytest.raises(AttributeError, match="no attribute 'colour'"):
             one.colour  # noqa: B018

@@ -135,7 +135,7 @@ def test_unknown_aspect_stays_unknown_after_a_restart(tmp_path):
         view = View(online, robot, MISSPELT)
         assert online.view(view).get(view) is None
     with local(tmp_path, worlds=["online"]) as cell:
-        assert cell.aspects() == {}
+        assert cell.aspects() == ()
         assert cell.world("online").init(robot, Aspect("plann", int), 3)
 
 
@@ -158,7 +158,7 @@ def test_observer_registers_nothing(two_shards):
         with pytest.raises(NullDatumError):
             seen.get_untyped(right, "plan")
         assert len(seen.at(online.history(left, PLAN)[0].position).list_slots()) == 1
-        assert seen.diff(seen, aspects=[PLAN]).rows == ()
+        assert seen.diff(seen, "**", PLAN).rows == ()
         with seen.watch("**", PLAN, MISSPELT) as watch:
             assert watch.next(60.0) is not None
         with pytest.raises(DatumTypeError, match="'plan' is registered with datum type"):
@@ -174,8 +174,8 @@ def test_observer_registers_nothing(two_shards):
 def test_comparison_by_a_misspelt_name_is_refused(world, cell):
     """A name alone says nothing of an aspect; one with its type is null until somebody writes it."""
     with pytest.raises(MisuseError, match=r"no aspect 'plann' is registered.*'plan'\?"):
-        world.diff(cell.world("training"), aspects=["plann"])
-    assert world.diff(cell.world("training"), aspects=[MISSPELT]).rows == ()
+        world.diff(cell.world("training"), "**", "plann")
+    assert world.diff(cell.world("training"), "**", MISSPELT).rows == ()
     with world.watch_diff(cell.world("training"), "**", MISSPELT) as watch:
         assert watch.next(0.0) is None
         world.init(robot, MISSPELT, [1.0])

@@ -128,7 +128,9 @@ def test_what_has_no_data_goes_at_once(enact, stopped):
     store.write([Persist(0, (*worlds, *fat), Durability.DURABLE)])
     store.close()
     with local(stopped.parent / "data" / "left") as cell:
-        assert cell.aspects()["number"] == ("int", "durable")
+        assert ("number", "int", "durable") in {
+            (a.aspect, a.type, a.durability) for a in cell.aspects()
+        }
         assert cell.shards()[0].counters["catalogue_left_out"] > 0
         with pytest.raises(LinkError, match=r"world contexts.* at most 4096; .*forget --unused"):
             cell.create_world("lab")
@@ -147,7 +149,7 @@ def test_what_has_no_data_goes_at_once(enact, stopped):
         assert "catalogue_left_out" not in cell.shards()[0].counters
         cell.create_world("lab")
         assert [info.version for info in cell.world("online").list_slots("**")] == [2, 2]
-        assert sorted(cell.aspects()) == ["cloud", "number"]
+        assert sorted({one.aspect for one in cell.aspects()}) == ["cloud", "number"]
 
 
 def test_unused_wants_all_shards_and_nothing_named_is_refused(enact, stopped):

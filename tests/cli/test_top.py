@@ -19,7 +19,7 @@ from enact_dist.cli.main import main
 from enact_dist.cli.top.tables import TABLES, headline
 from enact_dist.operate.cell_rates import Looks
 from enact_dist.world.listings import ActorInfo, LockInfo, ShardInfo
-from enact_dist.world.look import Look
+from enact_dist.world.look import Look, look_at
 
 pytest.importorskip("textual", reason="enact top needs the extra 'view'")
 
@@ -303,10 +303,10 @@ def test_world_context_that_the_cell_does_not_have_is_refused(enact, cell_file):
 def test_looking_leaves_nothing_behind_at_the_shards(cell_file):
     """No session, no lock and no commit are made by it."""
     with connect(cell_file, observer=True) as cell:
-        before = cell.look()
+        before = look_at(cell)
         looks = Looks()
         for _ in range(3):
-            rates = looks.add(cell.look())
+            rates = looks.add(look_at(cell))
 
     assert [one.commits_hz for one in rates.shards] == [0.0, 0.0]
     assert rates.actors == tuple(Looks().add(before).actors)
@@ -325,11 +325,11 @@ def test_shard_that_is_killed_is_away_and_comes_back(spawn, until, enact, write_
 
         def seen(wanted):
             end_s = time.monotonic() + PATIENCE_S
-            while not wanted(rates := looks.add(cell.look())):
+            while not wanted(rates := looks.add(look_at(cell))):
                 assert time.monotonic() < end_s
             return rates
 
-        assert not looks.add(cell.look()).away
+        assert not looks.add(look_at(cell)).away
         shards["right"].kill()
         shards["right"].wait()
         gone = seen(lambda rates: rates.away)

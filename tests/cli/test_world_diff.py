@@ -234,7 +234,7 @@ def writer(cell):
 def test_contexts_are_seen_at_one_moment_over_both_shards(cell, writer):
     """What one lock writes to both contexts, on both shards, never differs in between."""
     training, online = cell.world("training"), cell.world("online")
-    diffs = [training.diff(online, "sum/*", [COUNT]) for _ in range(40)]
+    diffs = [training.diff(online, "sum/*", COUNT) for _ in range(40)]
     assert [(len(diff), diff.equal) for diff in diffs] == [(0, 4)] * 40
 
 
@@ -255,7 +255,7 @@ def test_comparing_holds_no_lock_where_there_is_no_cut(cell, cell_file, writer, 
         diffs, ends_s = [], time.monotonic() + 60.0
         while len(diffs) < 20 or not other.statistics().get("views_locked", 0):
             assert time.monotonic() < ends_s, "the writer never came in between"
-            diffs.append(one.diff(two, "sum/*", [COUNT, own]))
+            diffs.append(one.diff(two, "sum/*", COUNT, own))
     assert {(len(diff), diff.equal) for diff in diffs} == {(0, 5)}
     assert held == []
 

@@ -83,7 +83,7 @@ def use_by_the_old_type(cell, use):
             with Lock(view) as lock:
                 lock.get(view)
         case "diff":
-            online.diff(cell.world("copy"), aspects=[OLD])
+            online.diff(cell.world("copy"), "**", OLD)
 
 
 def test_the_old_type_is_taken_again_where_nobody_has_a_new_one(make_cell, monkeypatch):

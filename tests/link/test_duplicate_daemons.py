@@ -32,6 +32,7 @@ from enact_dist.link.daemon.daemon import start_shard
 from enact_dist.link.daemon.settings import DaemonSettings
 from enact_dist.link.zenoh.discovery import FoundShard
 from enact_dist.operate.doctor_cell import duplicate_daemons
+from enact_dist.world.look import welcomes
 
 COUNT = Aspect("count", int)
 ASK_S = 10.0
@@ -133,7 +134,7 @@ def test_same_daemon_at_another_address_is_no_second_one(begin, free):
         put(cell, "right/a", 1)
         put(cell, "left/a", 2)
         assert "shards_doubted" not in cell.statistics()
-        assert list(duplicate_daemons("cell", None, cell.welcomes())) == []
+        assert list(duplicate_daemons("cell", None, welcomes(cell))) == []
     assert len(serving("cell", "left", (first, other), timeout_s=ASK_S)) == 1
 
 
@@ -151,7 +152,7 @@ def test_client_that_hears_of_a_second_daemon_trusts_neither(begin, free):
         assert first in str(refused.value)
         assert second in str(refused.value)
         assert cell.statistics()["shards_doubted"] == 1
-        (finding,) = duplicate_daemons("cell", None, cell.welcomes())
+        (finding,) = duplicate_daemons("cell", None, welcomes(cell))
         assert (finding.subject, first in finding.text, second in finding.text) == (
             "shard left",
             True,
@@ -174,7 +175,7 @@ def test_doctor_asks_at_each_place_that_file_and_shards_name(begin, free):
         placement_map=lambda: PlacementMap(1, (ShardEntry("left", (second,)),), ()),
     )
     with connect(first) as cell:
-        (finding,) = duplicate_daemons("cell", file, cell.welcomes())
+        (finding,) = duplicate_daemons("cell", file, welcomes(cell))
     assert "stop all but the one whose data you want to keep" in finding.remedy
 
 

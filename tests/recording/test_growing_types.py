@@ -83,6 +83,8 @@ def test_recording_across_the_change_names_the_newer_type(online, recorded):
 
     with local(worlds=["online"]) as other:
         assert Replay(other, path, speed=0.0).run().versions == 2
-        assert other.aspects()["spot"][0] == "Spot{x_mm:float,name:str=}"
+        assert [one.type for one in other.aspects() if one.aspect == "spot"] == [
+            "Spot{x_mm:float,name:str=}"
+        ]
         found = other.world("online").history(piece, NEW)
         assert [version.datum() for version in found] == [New(1.0, "spot"), New(2.0, "edge")]

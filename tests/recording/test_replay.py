@@ -81,7 +81,7 @@ def test_worlds_and_aspects_are_made(cell, run):
     copy = cell.world("copy")
     assert copy.view(View(copy, piece, VALUE))[View(copy, piece, VALUE)] == 10
     assert not cell.world("online").list_slots()
-    assert cell.aspects()["value"][0] == "int"
+    assert {one.aspect: one.type for one in cell.aspects()}["value"] == "int"
 
 
 def test_world_that_the_recording_does_not_have_is_named(cell, run):

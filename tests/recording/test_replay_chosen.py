@@ -124,7 +124,7 @@ def pieces(tmp_path):
 def test_an_actor_that_declares_to_write_the_same_is_named_before(cell, pieces):
     """Though it has written nothing so far: it waits for what is replayed."""
     row = ActorStatistics("weighing", "running", writes=("online:piece/value", "online:piece/name"))
-    cell.set_report(encode_reports([row]))
+    cell._client.set_report(encode_reports([row]))
     told = []
     seen = []
 
@@ -146,7 +146,7 @@ def test_an_actor_that_writes_something_else_is_not_named(cell, pieces, options)
     """Other entities, another world context, or it has ended."""
     state = options.pop("state", "running")
     row = ActorStatistics("weighing", state, writes=("online:piece/value",))
-    cell.set_report(encode_reports([row]))
+    cell._client.set_report(encode_reports([row]))
     told = []
 
     Replay(cell, pieces, speed=0.0, **options).run(warn=told.append)

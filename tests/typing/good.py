@@ -65,7 +65,7 @@ def count_contacts() -> None:
         snapshot = online.view(view)
         assert_type(snapshot[view], int)
         assert_type(snapshot.get(view, 0), int)
-        for row in online.diff(cell.world("training"), "work_*", [MESH, "contact_count"]):
+        for row in online.diff(cell.world("training"), "work_*", MESH, "contact_count"):
             assert_type(row.difference, Difference | None)
         assert_type(cell.why(online, bench, COUNT, 3, depth=2).children, tuple[CauseTree, ...])
         assert_type([one.version for one in cell.impact("online", "b", "c").walk()], list[int])

@@ -69,7 +69,7 @@ def show_packing(cell: Cell, console: Console) -> None:
     seen = online.view(results, flags)
     judged = {place: flag for place, flag in seen.get(flags, {}).items() if place in seen[results]}
     for name in last_forks(cell):
-        for row in cell.world(name).diff(online, PLACES, [STANDING]):
+        for row in cell.world(name).diff(online, PLACES, STANDING):
             if row.left is not None and row.right is not None:
                 console.print(f"{name} against online: {row.entity.name}: {row.difference}")
     bad = [place for place in judged if seen[results][place].result != "placed"]

@@ -136,7 +136,7 @@ def show_run(
 def show_score(cell: Cell, table: Table, score: str, console: Console) -> None:
     """Print table and score, and what is not as planned."""
     console.print("\n", table, f"\n{score}", sep="")
-    planned = cell.world("training").diff(cell.world("online"), PLACES, [STANDING])
+    planned = cell.world("training").diff(cell.world("online"), PLACES, STANDING)
     console.print("", difference_of(planned), "", sep="\n")
 
 

@@ -187,8 +187,11 @@ def _bound(made: _Made, cell: Cell, life: Life) -> ActorRun:
 
 def _warn_of_same_name(cell: Cell, name: str) -> None:
     """Say which other actors of this name run; several may be meant, so none is refused."""
+    from enact_dist.world.cell import session_behind
+    from enact_dist.world.listings import sessions_named
+
     try:
-        others = cell.sessions_named(name)
+        others = sessions_named(session_behind(cell).client, name)
     except EnactError as error:
         _log.info("whether another actor %s runs is not known: %s", name, error)
         return

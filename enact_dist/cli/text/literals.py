@@ -12,7 +12,7 @@ import re
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,9 @@ from numpy.typing import NDArray
 from enact_dist.access.session import unknown_aspect
 from enact_dist.config.table import path_of
 from enact_dist.errors import ConfigError, DatumTypeError, MisuseError
+
+if TYPE_CHECKING:
+    from enact_dist.core.protocol.messages import AspectEntry
 
 NOTHING: Final = object()
 """What `read` returns for the literal ``null``: the datum is to be deleted."""
@@ -41,23 +44,23 @@ _PLAIN: Final[Mapping[str, Any]] = {
 }
 
 
-def type_to_put(aspect: str, known: Mapping[str, tuple[str, str]], text: str, *, new: bool) -> Any:
+def type_to_put(aspect: str, known: Mapping[str, AspectEntry], text: str, *, new: bool) -> Any:
     """Return the datum type with which an aspect can be written.
 
     Args:
         aspect: Name of the aspect.
-        known: Registered aspects: name to (fingerprint, durability).
+        known: The registered aspects by name.
         text: The value as the command line has it.
         new: Whether an unknown aspect may be registered by the value's type.
 
     Raises:
         MisuseError: The aspect is unknown, or cannot be written from a command line.
     """
-    fingerprint = known.get(aspect, ("", ""))[0]
-    if fingerprint:
+    if aspect in known and (fingerprint := known[aspect].fingerprint):
         return type_of(aspect, fingerprint)
     if not new:
-        error = unknown_aspect(aspect, (name for name, entry in known.items() if entry[0]))
+        named = (name for name, entry in known.items() if entry.fingerprint)
+        error = unknown_aspect(aspect, named)
         raise MisuseError(f"{error}; --new registers it by the value's type")
     value = read(text, object)
     if value is NOTHING:

@@ -40,7 +40,7 @@ def list_aspects(cell: Cell, options: argparse.Namespace) -> Output:
     """List the aspects; where shards differ about one, a line for each way they know it."""
     if options.world:
         cell.world(options.world)
-    infos = cell.aspect_infos(options.world)
+    infos = cell.aspects(options.world)
     return Output(infos, rows=[_aspect_row(info) for info in infos])
 
 
@@ -99,12 +99,12 @@ def put_datum(cell: Cell, options: argparse.Namespace) -> Output:
     from enact_dist.access.lock import Lock
     from enact_dist.cli.text import literals
     from enact_dist.terms import Aspect, Write
+    from enact_dist.world.cell import session_behind
 
     entity, name = options.slot
     world = cell.world(options.world)
-    datum_type = literals.type_to_put(
-        name, cell.aspects(enough=name), options.value, new=options.new
-    )
+    known = session_behind(cell).registered(enough=name)
+    datum_type = literals.type_to_put(name, known, options.value, new=options.new)
     value = literals.read(options.value, datum_type)
     request = Write(world, Entity(entity), Aspect(name, datum_type))
     with Lock(request, wait_s=options.wait) as lock:

@@ -43,7 +43,7 @@ def show_diff(options: argparse.Namespace) -> Output:
         left = _context(cell, options.left, options.at1)
         right = _context(cell, options.right, options.at2)
         aspects = _aspects(options, cell, configured)
-        found = left.diff(right, options.entities, aspects)
+        found = left.diff(right, options.entities, *aspects)
     show = partial(print_diff, found, every=options.all)
     return Output(found.to_json, show, status=DIFFERENT if found else DONE)
 
@@ -131,8 +131,11 @@ def _aspects(
     options: argparse.Namespace, cell: Cell, configured: Mapping[str, Aspect[Any]]
 ) -> list[Aspect[Any] | str]:
     """Return what to compare: each aspect with the comparator that holds for it."""
+    from enact_dist.world.cell import session_behind
+
     tolerances = dict(options.tolerance)
-    registered = [name for name, (fingerprint, _) in cell.aspects().items() if fingerprint]
+    entries = session_behind(cell).registered()
+    registered = [name for name, entry in entries.items() if entry.fingerprint]
     names = options.aspect or sorted(registered)
     unknown = [name for name in tolerances if name and name not in names]
     if unknown:

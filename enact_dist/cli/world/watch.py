@@ -18,6 +18,7 @@ from enact_dist.core.protocol.datum import Slot
 from enact_dist.errors import LinkError, ProtocolError, ShardUnreachableError
 from enact_dist.link.signals import StopSignals
 from enact_dist.wire.payload import decode_untyped
+from enact_dist.world.cell import session_behind
 from enact_dist.world.trees import shown_s
 from enact_dist.world.version_data import Retained, Wanted, explained, found_of
 
@@ -59,7 +60,7 @@ def watch_world(options: argparse.Namespace) -> int:
 
 def _tell_unknown(wanted: Iterable[str], cell: Cell) -> None:
     """Name the aspects that no shard knows yet: their first datum may never arrive."""
-    known = cell.aspects()
+    known = session_behind(cell).registered()
     for name in wanted:
         if name not in known:
             close = suggestion(name, known)

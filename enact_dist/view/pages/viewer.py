@@ -149,8 +149,9 @@ class Viewer(Closing):
         cell = self.cell.cell
         first, second = (cell.world(side.world).at(_moment(side.at_ns)) for side in (left, right))
         compared = {aspect.name: aspect for aspect in self._settings.aspects()}
-        names = [name for name, (fingerprint, _) in cell.aspects().items() if fingerprint]
-        return first.diff(second, aspects=[compared.get(name, name) for name in sorted(names)])
+        entries = self.cell.session.registered()
+        names = sorted(name for name, entry in entries.items() if entry.fingerprint)
+        return first.diff(second, "**", *(compared.get(name, name) for name in names))
 
     def pin(self, label: str, versions: list[Made]) -> None:
         """Pin versions: the one thing that a page changes, and only if a person asks for it.

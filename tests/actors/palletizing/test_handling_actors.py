@@ -219,7 +219,7 @@ def test_what_is_expected_is_written_into_a_fork_before_each_risky_stage(cell):
     assert forks(cell) == ["expected-1-place", "expected-1-push"]
     looked(cell, "tray", "moved", x_m=0.02)
     write(cell, PLACE, words.STANDING, words.Standing("milk_carton", "moved", 20.0, 0.0))
-    [found] = cell.world("expected-1-push").diff(online, words.PLACES, [words.STANDING])
+    [found] = cell.world("expected-1-push").diff(online, words.PLACES, words.STANDING)
     assert found.entity == PLACE
     assert last_forks(cell) == ["expected-1-push"]
     standing = View(cell.world("expected-1-place"), PLACE, words.STANDING)
@@ -254,9 +254,9 @@ def test_a_package_that_is_removed_is_expected_to_be_seen_nowhere(cell):
     packed(cell, "held", "rejected", "aside")
     assert forks(cell) == ["expected-1-regrasp", "expected-1-remove"]
     online, expected = cell.world("online"), cell.world("expected-1-remove")
-    assert expected.diff(online, words.PACKAGES, [words.SIGHTING])
+    assert expected.diff(online, words.PACKAGES, words.SIGHTING)
     write(cell, PACKAGE, words.SIGHTING, replace(seen, frame=""))
-    assert not expected.diff(online, words.PACKAGES, [words.SIGHTING])
+    assert not expected.diff(online, words.PACKAGES, words.SIGHTING)
 
 
 def test_forks_of_an_earlier_generator_are_dropped_and_no_others(cell):

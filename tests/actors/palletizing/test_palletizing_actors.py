@@ -77,7 +77,7 @@ def test_cell_judges_a_sequence_of_packages(cell, capsys):
     assert len(get(cell.world("online"), USER, NOTICES)) == PACKAGE_COUNT
     for stop, kind in enumerate(truths):
         assert (flags[f"place/{stop}"].package == "") == (kind == "missing")
-    diff = cell.world("training").diff(cell.world("online"), PLACES, [STANDING])
+    diff = cell.world("training").diff(cell.world("online"), PLACES, STANDING)
     damaged = {f"place/{stop}": verdict for stop, verdict in enumerate(verdicts) if verdict != "ok"}
     assert {row.entity.name: row.right is not None for row in diff} == dict.fromkeys(damaged, True)
     for row in diff:

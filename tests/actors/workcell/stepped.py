@@ -26,6 +26,7 @@ from actors.workcell.simulation.drawing.render import View as Room
 from actors.workcell.simulation.room import cameras
 from actors.workcell.simulation.sources import LiveSource
 from enact_dist import Lock, View, Write, testing
+from enact_dist.access.reads import slot_of
 from enact_dist.actor.running.load import configured_actor
 from enact_dist.config.read import load_config
 
@@ -292,7 +293,7 @@ class Stepped:
                 self._newest[slot] = info.version
                 view = View(context, info.entity, ASPECTS[info.aspect])
                 seen = context.view(view)
-                state, datum = seen.state(view), seen.get(view)
+                state, datum = seen._readings.state(slot_of(view)), seen.get(view)
                 if state is not None:
                     kept = Kept(state.captured_ns, state.stamp_ns, datum)
                     self.versions.setdefault(slot, []).append(kept)

@@ -18,6 +18,7 @@ from actors.workcell.planning import PathPlanning
 from actors.workcell.scores.evaluation import score
 from actors.workcell.scores.scenario_checks import checks_of
 from enact_dist import Lock, View, Write, testing
+from enact_dist.access.reads import slot_of
 
 from . import stepped as stepping
 from .stepped import stepped
@@ -120,7 +121,7 @@ def test_online_never_sees_what_the_planner_of_a_fork_does(monkeypatch: pytest.M
             for entity, aspect in read:
                 view, copy = View(online, entity, aspect), Write(fork, entity, aspect)
                 seen_there = online.view(view)
-                state = seen_there.state(view)
+                state = seen_there._readings.state(slot_of(view))
                 if state is not None and seen_there.get(view) is not None:
                     with Lock(copy) as lock:
                         lock.put(copy, seen_there[view], stamp_ns=state.captured_ns)
