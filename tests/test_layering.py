@@ -45,6 +45,11 @@ UPWARD = {
     "cli/view.py -> view",
 }
 """Imports that lead up.  This list, and those below, can only shrink: the tests compare exactly."""
+DEMONSTRATED = {
+    "bench/cases/palletizing.py", "bench/cases/workcell.py", "cli/demo/palletizing.py",
+    "cli/demo/workcell.py", "cli/workcell.py",
+}  # fmt: skip
+"""The files of the package that show or measure the applications of `actors`, and import them."""
 CIRCLES: dict[str, int] = {}
 """Circles of imports that are left: the first file of each, and how many files it has."""
 MODULES_MAX = 12
@@ -175,6 +180,16 @@ def violations(file, package):
 def test_imports_point_down():
     """Every import of the package leads to its own part or to a lower one."""
     assert upward(PACKAGE) == UPWARD
+
+
+def test_only_demonstrations_import_the_applications():
+    """The package works without them."""
+    loads = {
+        str(file.relative_to(PACKAGE))
+        for file in python_files(PACKAGE)
+        if any(name.split(".")[0] == "actors" for name in imports(file))
+    }
+    assert loads == DEMONSTRATED
 
 
 def test_core_and_wire_are_pure():
