@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from enact_dist.world.listings import ShardInfo
 
 PYTHON_MIN: Final = (3, 11)
+KNOCK_S: Final = 2.0
 
 LIBRARIES: Final = {
     "libusb-1.0.so.0": "libusb-1.0-0",
@@ -323,12 +324,12 @@ def _unreachable(subject: str, endpoint: str) -> Finding:
     return fail(subject, f"{endpoint} does not answer: {'; '.join(found)}", "; ".join(remedies))
 
 
-def knock(endpoint: str, *, timeout_s: float = 2.0) -> tuple[str, str]:
+def knock(endpoint: str) -> tuple[str, str]:
     """Say why an endpoint such as ``tcp/host:port`` may not answer, and what to do about it."""
     host, _, port = endpoint.partition("/")[2].rpartition(":")
     host = host.strip("[]")
     try:
-        socket.create_connection((host, int(port)), timeout_s).close()
+        socket.create_connection((host, int(port)), KNOCK_S).close()
     except socket.gaierror:
         return (
             f"the host name {host} is unknown",

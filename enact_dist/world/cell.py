@@ -214,9 +214,12 @@ class Cell(FormerNames, Closing):
         deadline_s = time.monotonic() + timeout_s
         while True:
             left_s = max(0.0, deadline_s - time.monotonic())
-            wait_s, stamp_ns, timeout_s = min(left_s, 0.5), position.stamp_ns, left_s + 1.0
             if await_stamp(
-                self._client, position.shard, stamp_ns, wait_s=wait_s, timeout_s=timeout_s
+                self._client,
+                position.shard,
+                position.stamp_ns,
+                wait_s=min(left_s, 0.5),
+                timeout_s=left_s + 1.0,
             ):
                 return True
             if time.monotonic() >= deadline_s:

@@ -11,7 +11,6 @@ from ports import free_port
 
 from enact_dist import Aspect, Durability, Entity, View, connect
 from enact_dist.actor.report import read_reports
-from enact_dist.actor.running.process import actor_command
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -64,13 +63,11 @@ def endpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
 def test_spawned_actor_updates_reports_and_ends_when_terminated(endpoint: str):
     """Its options and roles come from the command; its report is seen by others; exit is 0."""
     entity = Entity("v/1")
-    command = actor_command(
-        "sample_scale:Scale",
-        cell=endpoint,
-        name="scale",
-        worlds={"online": "online"},
-        options={"factor": 3},
-    )
+    command = [
+        *(sys.executable, "-m", "enact_dist.cli.main", "actor", "run", "sample_scale:Scale"),
+        *("--cell", endpoint, "--name", "scale", "--world", "online=online"),
+        *("--option", "factor=3"),
+    ]
     actor = subprocess.Popen(command, stdin=subprocess.DEVNULL)
     try:
         with connect(endpoint, actor="test") as cell:

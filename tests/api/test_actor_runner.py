@@ -15,7 +15,6 @@ from enact_dist.actor.actor import Actor
 from enact_dist.actor.binding import BoundActor
 from enact_dist.actor.inbox import Inbox, Watching
 from enact_dist.actor.report import read_reports
-from enact_dist.actor.running.process import actor_command
 from enact_dist.actor.running.runner import run_actor
 from enact_dist.errors import (
     ChangedError,
@@ -468,15 +467,3 @@ def test_actor_is_refused_when_it_has_no_update(cell):
     """A base class cannot run."""
     with pytest.raises(MisuseError, match="defines update"):
         run_actor(Actor(), cell, stop=threading.Event())
-
-
-def test_command_names_cell_worlds_and_options_when_an_actor_is_a_process():
-    """A process is started by the same command a user would type."""
-    command = actor_command(
-        "actors.x:Y", cell="cell.toml", name="y", worlds={"r": "w"}, options={"tol_m": 0.1}
-    )
-
-    assert command[1:] == [
-        "-m", "enact_dist.cli.main", "actor", "run", "actors.x:Y",
-        "--cell", "cell.toml", "--name", "y", "--world", "r=w", "--option", "tol_m=0.1",
-    ]  # fmt: skip

@@ -20,7 +20,6 @@ from enact_dist import (
 )
 from enact_dist.actor.binding import BoundActor
 from enact_dist.actor.check import check_actors
-from enact_dist.actor.running.process import actor_command
 from enact_dist.actor.uses import ActorDeclaration
 from enact_dist.errors import MisuseError
 
@@ -213,9 +212,3 @@ def test_actors_of_one_class_are_told_apart_by_their_names():
             for actor in (Worker(), only(Worker(), "camera/1"), only(Camera(), "camera/1"))
         ]
     assert names == ["Worker", "Worker-camera-1", "Camera-camera-1"]
-
-
-def test_command_of_a_process_names_the_entity():
-    """A process that it starts works on the same one."""
-    command = actor_command("cameras:Camera", cell="cell.toml", entity="camera/7")
-    assert command[-2:] == ["--entity", "camera/7"]

@@ -159,7 +159,7 @@ def final_look(found):
     return next(
         lock
         for lock in found.locks.values()
-        if lock.client == evidence.FINAL and lock.told is LockOutcome.COMMITTED
+        if lock.client == "final" and lock.told is LockOutcome.COMMITTED
     )
 
 

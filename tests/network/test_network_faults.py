@@ -12,7 +12,6 @@ from network_site import LONG_S, SHARDS, TTL_S
 from polling import until
 
 from enact_dist import ActorThread, local
-from enact_dist.actor.running.process import actor_command
 from enact_dist.verify.chaos.network.switch import Cable
 from enact_dist.verify.daemons import COMMAND
 
@@ -73,7 +72,7 @@ def test_actors_far_apart_find_what_they_find_in_one_process(whole):
             thread.stop()
 
     for host, actor in {"near": "Camera", "far": "Measuring", "s1": "Counting"}.items():
-        words = actor_command(f"production_line:{actor}", cell=whole.cell.file)[3:]
+        words = ("actor", "run", f"production_line:{actor}", "--cell", str(whole.cell.file))
         whole.run(host, COMMAND, *words)
     reader = whole.run("watch", "production_line", str(whole.cell.file))
 

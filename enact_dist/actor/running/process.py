@@ -6,7 +6,6 @@ spawned, never forked: a forked child would share its parent's session without t
 
 from __future__ import annotations
 
-import sys
 import threading
 from typing import TYPE_CHECKING, Self
 
@@ -15,7 +14,6 @@ from enact_dist.errors import MisuseError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from pathlib import Path
 
     from enact_dist.actor.actor import Actor
     from enact_dist.actor.report import ActorStatistics
@@ -104,35 +102,3 @@ class ActorThread:
             self._run.run()
         except BaseException as error:  # noqa: BLE001 (raised again by join)
             self._error = error
-
-
-def actor_command(
-    target: str,
-    *,
-    cell: str | Path,
-    name: str = "",
-    worlds: Mapping[str, str] | None = None,
-    options: Mapping[str, object] | None = None,
-    entity: str = "",
-) -> list[str]:
-    """Return the command that runs an actor as a process of its own.
-
-    The process ends on SIGTERM after its current update; its log goes to standard error.
-
-    Args:
-        target: ``MODULE:CLASS``.
-        cell: A `cell.toml` or an endpoint.
-        name: Name of the actor; by default its class's.
-        worlds: Role → name of a world context.
-        options: Parameters of the class, as text, numbers or truth values.
-        entity: The one entity that it works on; by default all that its patterns match.
-    """
-    command = [sys.executable, "-m", "enact_dist.cli.main", "actor", "run", target]
-    command += ["--cell", str(cell)]
-    command += ["--name", name] if name else []
-    for role, world in (worlds or {}).items():
-        command += ["--world", f"{role}={world}"]
-    for option, value in (options or {}).items():
-        command += ["--option", f"{option}={value}"]
-    command += ["--entity", entity] if entity else []
-    return command

@@ -104,8 +104,8 @@ def bytes_with(writes: Iterable[WriteItem]) -> int:
     return size
 
 
-def request_timeout_s(request: Request) -> float:
-    """Return how long to wait for the answer to one call."""
+def attempt_timeout_s(request: Request) -> float:
+    """Return how long one attempt of a call waits for its answer."""
     if isinstance(request, Acquire):
         return request.wait_ns / 1e9 + CALL_S
     if isinstance(request, _WITH_DATA):

@@ -36,7 +36,7 @@ from enact_dist.core.protocol.placement import shard_of
 from enact_dist.core.shard.on_lock import NEWER_TYPE
 from enact_dist.core.state.clock import is_kept
 from enact_dist.errors import CommitUnknownError, EnactError, MisuseError
-from enact_dist.link.client.calls import BYTES_PER_S_MIN, CALL_S, bytes_with, request_timeout_s
+from enact_dist.link.client.calls import BYTES_PER_S_MIN, CALL_S, attempt_timeout_s, bytes_with
 from enact_dist.link.client.kept import WantedLock
 from enact_dist.link.client.lanes import name_of, read_name
 from enact_dist.link.client.session import (
@@ -254,7 +254,7 @@ class CellClient(SessionClient):
                     calls = [(shard, self._sendable(shard, request)) for shard, request in calls]
                 if len(calls) == 1 and not self._further.doubted:
                     shard, request = calls[0]
-                    timeout_s = request_timeout_s(request)
+                    timeout_s = attempt_timeout_s(request)
                     answer = self.carrier.request(
                         shard, request, timeout_s=timeout_s, interrupt=interrupt
                     )

@@ -40,7 +40,7 @@ from enact_dist.core.protocol.messages import (
 from enact_dist.core.protocol.placement import shard_of
 from enact_dist.errors import EnactError, MisuseError
 from enact_dist.link.carrier import FORKED_REMEDY
-from enact_dist.link.client.calls import CALL_S, Calls, request_timeout_s
+from enact_dist.link.client.calls import CALL_S, Calls, attempt_timeout_s
 from enact_dist.link.client.catalogue import CATALOGUES, FurtherShards, KnownCatalogue
 from enact_dist.link.client.kept import KeptUses
 from enact_dist.link.client.lanes import Lanes
@@ -314,8 +314,8 @@ class SessionClient:
             self._further.check(calls)
         if len(calls) == 1:
             shard, request = calls[0]
-            return [self.carrier.request(shard, request, timeout_s=request_timeout_s(request))]
-        longest_s = max((request_timeout_s(request) for _, request in calls), default=CALL_S)
+            return [self.carrier.request(shard, request, timeout_s=attempt_timeout_s(request))]
+        longest_s = max((attempt_timeout_s(request) for _, request in calls), default=CALL_S)
         return self.carrier.request_all(calls, timeout_s=longest_s)
 
     def _take(self, shard: str, request: Request, answer: Answer, sent_in: int = 0) -> None:

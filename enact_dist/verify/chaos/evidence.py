@@ -26,7 +26,6 @@ from enact_dist.verify.checker import LockOutcome
 
 SETTINGS: Final = "settings.json"
 FAULTS: Final = "faults.log"
-FINAL: Final = "final"
 
 
 @dataclass(slots=True, eq=False)

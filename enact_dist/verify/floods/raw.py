@@ -110,14 +110,13 @@ class RawZenoh:
         shard: str,
         message: Request,
         *,
-        verb: str = "",
         actor: str = ACTOR,
         timeout_s: float = ANSWER_S,
     ) -> Answer | None:
         """Send a message and return its answer; None if none came."""
         header, payload = encode_frame(message)
         replies = self.session.get(
-            self.key(shard, verb or verb_of(message), actor),
+            self.key(shard, verb_of(message), actor),
             payload=payload or b"",
             attachment=header,
             timeout=timeout_s,
