@@ -18,6 +18,7 @@ from numbers import Real
 from typing import Any, Final, NamedTuple, TypeVar
 
 from enact_dist.core.protocol.datum import Position
+from enact_dist.core.protocol.messages import HOLD_NS_MAX
 from enact_dist.errors import MisuseError
 from enact_dist.terms import Aspect, Context, Entities, Entity, checked_name, wrong_argument
 from enact_dist.wire.limits import REASON_CHARACTERS_MAX
@@ -122,8 +123,7 @@ def check_seconds(name: str, found: object) -> None:
     raise MisuseError(f"{name} is {found!r}; it must be a number of seconds{remedy}")
 
 
-HOLD_S_MAX: Final = 24 * 3600.0
-"""How long a lock may be held at most."""
+HOLD_S_MAX: Final = HOLD_NS_MAX / 1e9
 
 
 def check_hold(name: str, found: object) -> None:

@@ -16,9 +16,9 @@ from typing import Any, Final
 from enact_dist.core.protocol.datum_types import DEFAULT_MARK
 from enact_dist.wire.shapes import shape_of, text_of
 
-FINGERPRINT_CHARACTERS_MAX: Final = 2000
-"""A longer one has no marks; if it is still longer, it is cut and ends in a digest of the whole.
-Fields cannot be added to such a type."""
+UNCUT_CHARACTERS_MAX: Final = 2000
+"""A longer fingerprint has no marks; if it is still longer, it is cut and ends in a digest of the
+whole.  Fields cannot be added to such a type."""
 
 
 def fingerprint(datum_type: Any) -> str:
@@ -29,10 +29,10 @@ def fingerprint(datum_type: Any) -> str:
     """
     shape = shape_of(datum_type)
     text = text_of(shape, mark=DEFAULT_MARK)
-    if len(text) <= FINGERPRINT_CHARACTERS_MAX:
+    if len(text) <= UNCUT_CHARACTERS_MAX:
         return text
     text = text_of(shape)
-    if len(text) <= FINGERPRINT_CHARACTERS_MAX:
+    if len(text) <= UNCUT_CHARACTERS_MAX:
         return text
     digest = hashlib.sha256(text.encode()).hexdigest()
-    return f"{text[:FINGERPRINT_CHARACTERS_MAX]}…sha256:{digest}"
+    return f"{text[:UNCUT_CHARACTERS_MAX]}…sha256:{digest}"

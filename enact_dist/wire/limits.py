@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from typing import Final
 
+from enact_dist.core.protocol import parts
 from enact_dist.terms import NAME_LENGTH_MAX
 
 FRAME_VERSION: Final = 11
@@ -44,8 +45,8 @@ PAYLOAD_NAME: Final = re.compile(r"[0-9A-Za-z_]{1,64}-[0-9a-f]{1,16}\Z")
 both ends check it, since it becomes the name of a file."""
 DRAFT_NAME: Final = re.compile(r"(draft-[0-9a-f]{32})?\Z")
 """What a payload may be called before its commit, where its own name could be guessed."""
-PAYLOAD_BYTES_MIN: Final = 64 << 10
-"""Data up to this size travel with their commit and their grant, never as a payload."""
+PAYLOAD_BYTES_MIN: Final = parts.INLINE_BYTES_MAX
+"""Data up to this size are never a payload."""
 NAME_CHARACTERS_MAX: Final = NAME_LENGTH_MAX
 """Longest name of a context, entity, aspect, shard, session, actor or host."""
 REASON_CHARACTERS_MAX: Final = 500
@@ -55,10 +56,7 @@ TEXT_BYTES_MAX: Final = 64 << 10
 REPORT_FIELD_BYTES_MAX: Final = 64 << 10
 """Longest `report` that a keep-alive can have; a shard keeps one of at most
 `core.protocol.requests.REPORT_BYTES_MAX`, and counts longer ones."""
-ITEMS_MAX: Final = 4096
-"""Most lines of one lock and most writes of one commit.  A shard grants a lock, and applies a
-commit, in one step, which is what makes them atomic, and serves no other client meanwhile: about
-8 us for each slot, so 30 ms for so many, and half a second for 65,536."""
+ITEMS_MAX: Final = parts.ITEMS_MAX
 KEPT_VERSIONS_MAX: Final = 1 << 14
 """Most versions that one request pins; a shard pins at most 10,000 in all."""
 ENTRIES_MAX: Final = 1 << 18
@@ -73,7 +71,7 @@ ENCODING_BYTES_MAX: Final = 4096
 """Longest tree that stays in a datum's encoding; a longer one moves into its body."""
 TREE_BYTES_MAX: Final = 16 << 20
 """Longest tree of a datum: what is larger belongs into arrays."""
-INLINE_BYTES_MAX: Final = 256
+LEAF_BYTES_MAX: Final = 256
 """Longest text or bytes inside a tree; longer ones become buffers of the body."""
 DEPTH_MAX: Final = 32
 """Deepest nesting of a datum."""

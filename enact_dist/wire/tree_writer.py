@@ -20,7 +20,7 @@ from enact_dist.wire.limits import (
     BODY_BYTES_MAX,
     DEPTH_MAX,
     DIMENSIONS_MAX,
-    INLINE_BYTES_MAX,
+    LEAF_BYTES_MAX,
     aligned,
 )
 from enact_dist.wire.shapes import (
@@ -117,7 +117,7 @@ class TreeWriter:
         if kind is str:
             return self._text(value)
         if kind is bytes:
-            return value if len(value) <= INLINE_BYTES_MAX else reference(BYTES, *self.add(value))
+            return value if len(value) <= LEAF_BYTES_MAX else reference(BYTES, *self.add(value))
         if kind is list:
             return self._list(value, _EACH_PLAIN, depth)
         if kind is dict:
@@ -132,13 +132,13 @@ class TreeWriter:
         raise _no_plain(value)
 
     def _text(self, value: str) -> object:
-        if len(value) <= INLINE_BYTES_MAX and value.isascii():
+        if len(value) <= LEAF_BYTES_MAX and value.isascii():
             return value
         try:
             raw = value.encode()
         except UnicodeEncodeError as error:
             raise MisfitError(f"text with a lone surrogate at {error.start}") from None
-        return value if len(raw) <= INLINE_BYTES_MAX else reference(TEXT, *self.add(raw))
+        return value if len(raw) <= LEAF_BYTES_MAX else reference(TEXT, *self.add(raw))
 
     # ---------------------------------------------------------------- arrays and containers
 

@@ -73,7 +73,7 @@ def without_body(write):
 @pytest.fixture(autouse=True)
 def little(monkeypatch):
     """Everything from 64 KiB on travels ahead."""
-    monkeypatch.setattr(transfer, "INLINE_BYTES_MAX", 64 << 10)
+    monkeypatch.setattr(transfer, "UNSTAGED_BYTES_MAX", 64 << 10)
 
 
 def write_of(name, size, seed=1):

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from enact_dist import Aspect
 from enact_dist.errors import DatumTypeError, MisuseError, ProtocolError
 from enact_dist.wire.codecs import register_codec
-from enact_dist.wire.fingerprint import FINGERPRINT_CHARACTERS_MAX, fingerprint
+from enact_dist.wire.fingerprint import UNCUT_CHARACTERS_MAX, fingerprint
 from enact_dist.wire.payload import decode_datum, encode_datum
 
 
@@ -109,7 +109,7 @@ def test_fingerprint_of_a_large_type_is_bounded_and_still_tells_apart():
         for last in ({"last": int}, {"last": str})
     )
 
-    assert len(fingerprint(one)) < FINGERPRINT_CHARACTERS_MAX + 100
+    assert len(fingerprint(one)) < UNCUT_CHARACTERS_MAX + 100
     assert fingerprint(one) != fingerprint(other)
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from enact_dist.core.protocol.datum import Datum
 from enact_dist.errors import DatumTypeError
 from enact_dist.wire.codecs import register_codec
-from enact_dist.wire.limits import ALIGNMENT, ENCODING_BYTES_MAX, INLINE_BYTES_MAX
+from enact_dist.wire.limits import ALIGNMENT, ENCODING_BYTES_MAX, LEAF_BYTES_MAX
 from enact_dist.wire.payload import decode_datum, decode_untyped, encode_datum
 
 
@@ -238,11 +238,11 @@ def test_datum_size_is_the_length_of_its_body():
 
 def test_datum_moves_long_text_and_bytes_into_the_body():
     """Up to 256 bytes stay in the tree; longer ones are referred to."""
-    assert encode_datum("x" * INLINE_BYTES_MAX, str).size == 0
-    assert encode_datum("x" * (INLINE_BYTES_MAX + 1), str).body == b"x" * (INLINE_BYTES_MAX + 1)
-    assert encode_datum("ü" * (INLINE_BYTES_MAX // 2), str).size == 0
-    assert encode_datum("ü" * (INLINE_BYTES_MAX // 2 + 1), str).size == INLINE_BYTES_MAX + 2
-    assert encode_datum(b"x" * (INLINE_BYTES_MAX + 1), bytes).size == INLINE_BYTES_MAX + 1
+    assert encode_datum("x" * LEAF_BYTES_MAX, str).size == 0
+    assert encode_datum("x" * (LEAF_BYTES_MAX + 1), str).body == b"x" * (LEAF_BYTES_MAX + 1)
+    assert encode_datum("ü" * (LEAF_BYTES_MAX // 2), str).size == 0
+    assert encode_datum("ü" * (LEAF_BYTES_MAX // 2 + 1), str).size == LEAF_BYTES_MAX + 2
+    assert encode_datum(b"x" * (LEAF_BYTES_MAX + 1), bytes).size == LEAF_BYTES_MAX + 1
 
 
 @pytest.mark.parametrize("length", [1360, 1364, 1365, 1400, 100_000])

@@ -75,6 +75,8 @@ from enact_dist.core.protocol.answers import (
 from enact_dist.core.protocol.parts import (
     CAUSE_COMMIT,
     CAUSE_FORK,
+    INLINE_BYTES_MAX,
+    ITEMS_MAX,
     NO_LIMIT,
     NO_PLACE,
     NOT_KEPT,
@@ -104,6 +106,7 @@ from enact_dist.core.protocol.parts import (
     WriteItem,
 )
 from enact_dist.core.protocol.requests import (
+    HOLD_NS_MAX,
     PAGED,
     REPORT_BYTES_MAX,
     Acquire,

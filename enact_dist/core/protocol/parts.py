@@ -28,6 +28,15 @@ NO_LIMIT: Final = 1 << 62
 """Represents "no limit"; below the wire's largest integer, since messages may carry it."""
 
 
+ITEMS_MAX: Final = 4096
+"""Most lines of one lock and most writes of one commit.  A shard grants a lock, and applies a
+commit, in one step, which is what makes them atomic, and serves no other client meanwhile: about
+8 us for each slot, so 30 ms for so many, and half a second for 65,536."""
+INLINE_BYTES_MAX: Final = 64 << 10
+"""Data up to this size travel with their commit and their grant; larger ones are payloads, and are
+fetched when they are read."""
+
+
 class Item(NamedTuple):
     """One line of a lock or view: `access` is an `enact_dist.terms.Access` number.
 

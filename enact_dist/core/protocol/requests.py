@@ -48,6 +48,10 @@ class Register:
     aspects: tuple[AspectEntry, ...]
 
 
+HOLD_NS_MAX: Final = 24 * 3600 * 1_000_000_000
+"""A lock is held for a day at most; then the client must request it again."""
+
+
 @message
 class Acquire:
     """Ask for a set of locks at once, with views beside them.

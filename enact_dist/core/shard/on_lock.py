@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.core.protocol.checks import unknown_world, wrong_access
 from enact_dist.core.protocol.datum import Column, Datum, LockId, Slot
 from enact_dist.core.protocol.messages import (
+    ITEMS_MAX,
     Acquire,
     Answer,
     EpochChanged,
@@ -33,8 +34,6 @@ if TYPE_CHECKING:
     from enact_dist.core.shard.on_prepare import PrepareHandler
     from enact_dist.core.shard.state import ShardState
 
-ITEMS_MAX: Final = 4096
-"""Requests in one lock or view."""
 LOCKS_MAX: Final = 100_000
 """Locks, granted or waiting, at one shard."""
 LOOKED_MAX: Final = 1_000_000

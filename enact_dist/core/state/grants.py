@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.datum import LockId, Token
 from enact_dist.core.protocol.messages import (
+    HOLD_NS_MAX,
     NOT_KEPT,
     PLACES,
     Acquire,
@@ -47,8 +48,6 @@ if TYPE_CHECKING:
 
 WAIT_SLICE_NS_MAX: Final = 1_000_000_000
 """Longest time one request is parked; a client that still waits asks again (long poll)."""
-HOLD_NS_MAX: Final = 24 * 3600 * 1_000_000_000
-"""A lock is held for a day at most; then the client must request it again."""
 NOT_HELD: Final = "it is not held here (never granted, released, or forgotten)"
 HELD_TOO_LONG: Final = "held longer than its limit of"
 """So begins the cause of a lock that ends by its hold limit."""

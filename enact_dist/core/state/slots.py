@@ -16,7 +16,14 @@ from operator import itemgetter
 from typing import Final, NamedTuple
 
 from enact_dist.core.protocol.datum import Column, Datum, Slot
-from enact_dist.core.protocol.messages import Forgotten, Item, SlotState, SlotVersion, WriteItem
+from enact_dist.core.protocol.messages import (
+    INLINE_BYTES_MAX,
+    Forgotten,
+    Item,
+    SlotState,
+    SlotVersion,
+    WriteItem,
+)
 from enact_dist.core.protocol.records import (
     LOST,
     NOTHING,
@@ -32,11 +39,9 @@ from enact_dist.core.state.retention import AspectBases, Bases, PayloadNames
 from enact_dist.patterns import pattern_matches
 from enact_dist.terms import ACCESSES, NullReason
 
-INLINE_BYTES_MAX: Final = 64 * 1024
-"""Data up to this size travel with the grant; larger ones are fetched when they are read."""
 ANSWER_BYTES_MAX: Final = 8 << 20
 """So many bytes of small data travel with one grant; a pattern's further ones count as large."""
-LARGE_BYTES: Final = 64 << 10
+LARGE_BYTES: Final = INLINE_BYTES_MAX
 """Smaller data are not counted: they never lie in shared memory."""
 LOOKED_MAX: Final = 1000
 """Slots of a group that one question looks at."""

@@ -45,7 +45,7 @@ from enact_dist.link.client.session import (
     LEARNT,
     SessionClient,
 )
-from enact_dist.link.client.transfer import INLINE_BYTES_MAX, drop_staged, stage
+from enact_dist.link.client.transfer import UNSTAGED_BYTES_MAX, drop_staged, stage
 from enact_dist.link.refusals import error_of, not_committed, not_granted
 from enact_dist.terms import ACCESSES
 from enact_dist.wire.limits import COMMIT_BYTES_MAX
@@ -337,7 +337,7 @@ class CellClient(SessionClient):
                 return
             if writes and lock.phase is Phase.HELD:
                 size = sum(map(bytes_with, writes.values()))
-                if size > INLINE_BYTES_MAX:
+                if size > UNSTAGED_BYTES_MAX:
                     self._check_open(lock)
                     named = stage(self, writes, lambda: self._check_held(lock))
                     started_ns, size = self._now_ns(), sum(map(bytes_with, named.values()))

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from enact_dist.core.protocol.messages import Answer, Request
     from enact_dist.link.carrier import Begun, Carrier
 
-INLINE_BYTES_MAX: Final = 1 << 20
+UNSTAGED_BYTES_MAX: Final = 1 << 20
 """Data up to this total size go with their commit, since one slice costs as much.  Beyond it, data
 are staged, the largest first.
 """
@@ -122,12 +122,12 @@ def _named(client: Sender, writes: Sequence[WriteItem]) -> Sequence[WriteItem]:
     """Name each large datum of one shard's writes; return `writes` if nothing is staged."""
     inline = [(n, w.datum) for n, w in enumerate(writes) if w.datum and not w.datum.file]
     left = sum(datum.size for _, datum in inline)
-    if left <= INLINE_BYTES_MAX or client.carrier.inside:
+    if left <= UNSTAGED_BYTES_MAX or client.carrier.inside:
         return writes
     named = list(writes)
     inline.sort(key=lambda one: one[1].size, reverse=True)
     for number, datum in inline:
-        if datum.size <= PAYLOAD_BYTES_MIN and left <= INLINE_BYTES_MAX:
+        if datum.size <= PAYLOAD_BYTES_MIN and left <= UNSTAGED_BYTES_MAX:
             break
         left -= datum.size
         file = f"{client.core.session}-{next(client.staged_numbers):x}"

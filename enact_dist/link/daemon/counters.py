@@ -11,10 +11,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Final, NamedTuple
 
-from enact_dist.wire.limits import INLINE_BYTES_MAX
+from enact_dist.wire.limits import LEAF_BYTES_MAX
 
 BODIES: Final = (
-    f"arrays, long lists, texts and bytes over {INLINE_BYTES_MAX} B; other data count as 0"
+    f"arrays, long lists, texts and bytes over {LEAF_BYTES_MAX} B; other data count as 0"
 )
 """The part of a datum that counters of bytes count: its body (see `docs/protocol.md`)."""
 

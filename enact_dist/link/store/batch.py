@@ -29,7 +29,7 @@ from enact_dist.core.protocol.records import (
 )
 from enact_dist.link.folder.blobs import Blob
 from enact_dist.link.store.rows import (
-    INLINE_BYTES_MAX,
+    ROW_BODY_BYTES_MAX,
     Key,
     RowKind,
     RowOrder,
@@ -255,7 +255,7 @@ class Batch:
                 self.changes[key] = slot_body(record, None)
                 continue
             blob, body = self._shared_blob(staged), record.datum
-            if blob is None and body is not None and body.size > INLINE_BYTES_MAX:
+            if blob is None and body is not None and body.size > ROW_BODY_BYTES_MAX:
                 blob = bodies.write(body.body, durable=durable)
                 names_to_sync |= durable
             elif blob is not None and durable and not blob.synced:

@@ -43,7 +43,7 @@ from enact_dist.core.protocol.records import (
 from enact_dist.link.folder.blobs import Blob
 from enact_dist.link.store.fields import DamagedRowError, RowLayout, pack, unpack
 
-INLINE_BYTES_MAX: Final = 64 * 1024
+ROW_BODY_BYTES_MAX: Final = 64 * 1024
 """Bodies up to this size live in their row, larger ones in a file of their own."""
 
 
