@@ -25,10 +25,10 @@ import logging
 import threading
 import time
 from functools import partial
-from threading import get_ident
 from typing import TYPE_CHECKING, Final, cast
 
 from enact_dist.core.protocol.messages import (
+    OVERLOAD,
     Acquire,
     AwaitStamp,
     Commit,
@@ -222,7 +222,7 @@ class ShardHost:
                 return False
             if len(self._replies) >= PARKED_MAX:
                 self.count("overloads")
-                reply(Refused("overload", f"{PARKED_MAX} requests are parked at shard {self.name}"))
+                reply(Refused(OVERLOAD, f"{PARKED_MAX} requests are parked at shard {self.name}"))
                 return False
             self._handles += 1
             self._replies[self._handles] = reply
@@ -334,7 +334,7 @@ class ShardHost:
         self, message: Request | Event, handle: int, identity: str = "", subject: str | None = None
     ) -> None:
         """Let the shard decide, and perform its effects.  The mutex is held."""
-        if get_ident() == self._uninterrupted.main:
+        if threading.get_ident() == self._uninterrupted.main:
             with self._uninterrupted:
                 self._handle_now(message, handle, identity, subject)
         else:

@@ -9,7 +9,7 @@ import logging
 from typing import TYPE_CHECKING, Final, Protocol
 
 from enact_dist.core.failover.lease import Lease, Silence, kept_ns
-from enact_dist.core.protocol.messages import Commit, Prepare, Refused
+from enact_dist.core.protocol.messages import NO_ROOM, Commit, Prepare, Refused
 from enact_dist.errors import StoreError
 from enact_dist.link.clock import boottime_ns
 from enact_dist.terms import Durability
@@ -160,7 +160,7 @@ class AnswerGate:
             if entry is not None and entry.durability != Durability.VOLATILE.value:
                 self._count("data_too_large")
                 return Refused(
-                    "no_room",
+                    NO_ROOM,
                     f"{datum.size} bytes for {slot} are more than a database keeps of one datum"
                     f" ({DATABASE_BODY_BYTES_MAX}): make the aspect {slot.aspect} volatile, or keep"
                     " its shard in a folder",

@@ -5,13 +5,30 @@ Each text states what was requested, what was found, who holds it and what to do
 
 from __future__ import annotations
 
-import re
 import time
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.client.lock import MultiLock
 from enact_dist.core.client.plan import Phase
-from enact_dist.core.protocol.messages import PERMISSION, Answer, Forgotten, Holder, Item, Refused
+from enact_dist.core.protocol.messages import (
+    CLOCK_SKEW,
+    DAMAGED,
+    DATUM_TYPE,
+    HELD,
+    NO_ROOM,
+    OVERLOAD,
+    PERMISSION,
+    PROTOCOL,
+    TOO_LONG,
+    UNKNOWN_ASPECT,
+    UNKNOWN_WORLD,
+    VALUE,
+    Answer,
+    Forgotten,
+    Holder,
+    Item,
+    Refused,
+)
 from enact_dist.core.state.grants import HELD_TOO_LONG
 from enact_dist.errors import (
     SHARD_RESTARTED,
@@ -39,25 +56,20 @@ if TYPE_CHECKING:
 
 
 _CLASSES: Final[dict[str, type[EnactError]]] = {
-    "datum_type": DatumTypeError,
-    "unknown_aspect": MisuseError,
-    "value": MisuseError,
-    "held": MisuseError,
-    "protocol": ProtocolError,
-    "too_long": MisuseError,
-    "overload": LinkError,
-    "no_room": NoRoomError,
-    PERMISSION: PermissionDeniedError,
-    "damaged": StoreError,
+    DATUM_TYPE: DatumTypeError,
+    UNKNOWN_ASPECT: MisuseError,
+    VALUE: MisuseError,
+    HELD: MisuseError,
+    PROTOCOL: ProtocolError,
+    TOO_LONG: MisuseError,
+    OVERLOAD: LinkError,
+    NO_ROOM: NoRoomError,
+    DAMAGED: StoreError,
 }
 """The exception of each code of a refusal; any other code is a `LinkError`."""
 
-_NO_RIGHT: Final = re.compile(
-    r"(?P<identity>.+?) may not (?P<right>[a-z]+)\b"
-    r"(?: (?P<world>[^\s:/]+):(?P<entity>[^\s:]+)/(?P<aspect>[^\s:/]+))?"
-    r"[^:\n]*: it .*\((?P<rule>[^()]+)\)\Z"
-)
-"""How `core.rights` words a missing right."""
+_OF_A_RIGHT: Final = ("identity", "right", "rule", "world", "entity", "aspect")
+"""The facts of a missing right, as attributes of its error."""
 
 
 def unreachable(
@@ -213,16 +225,21 @@ def error_of(refused: Refused | Forgotten) -> EnactError:
     """Return the exception for a refusal."""
     if isinstance(refused, Forgotten):
         return forgotten(refused)
-    if refused.code == "unknown_world":
-        known = refused.text.partition("known: ")[2]
-        names = tuple(name for name in known.split(", ") if name not in ("", "none"))
-        return UnknownWorldError(refused.text, known=names)
-    if refused.code == "clock_skew":
-        ahead = re.search(r"(\d+\.\d+) s ahead", refused.text)
-        return ClockSkewError(refused.text, ahead_s=float(ahead[1]) if ahead else 0.0)
-    if refused.code == PERMISSION and (found := _NO_RIGHT.match(refused.text)) is not None:
-        return PermissionDeniedError(refused.text, **found.groupdict(""))
-    return _CLASSES.get(refused.code, LinkError)(refused.text)
+    code, text, facts = refused.code, refused.text, refused.facts
+    if code == UNKNOWN_WORLD:
+        return UnknownWorldError(text, known=facts)
+    if code == CLOCK_SKEW:
+        return ClockSkewError(text, ahead_s=_number_of(facts))
+    if code == PERMISSION:
+        return PermissionDeniedError(text, **dict(zip(_OF_A_RIGHT, facts, strict=False)))
+    return _CLASSES.get(code, LinkError)(text)
+
+
+def _number_of(facts: tuple[str, ...]) -> float:
+    try:
+        return float(facts[0])
+    except (IndexError, ValueError):
+        return 0.0  # a peer may send anything
 
 
 def error_for(answer: Answer, question: str) -> EnactError:

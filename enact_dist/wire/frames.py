@@ -179,7 +179,7 @@ def refusal_of(error: ProtocolError) -> m.Refused:
 
     Without any answer a client would take the shard for dead, and ask again and again.
     """
-    return m.Refused("too_long" if isinstance(error, FrameTooLongError) else "protocol", str(error))
+    return m.Refused(m.TOO_LONG if isinstance(error, FrameTooLongError) else m.PROTOCOL, str(error))
 
 
 def decode_frame(header: bytes, payload: bytes | memoryview = b"") -> m.Message:

@@ -20,7 +20,8 @@ own has succeeded; listings come in pages; whether a shard is there is asked by 
 names the start of its daemon; a
 request that waits for a stamp names its session; 8: a session may keep a grant, whose token a later
 commit names; 9: a lock may wait for news before it enters the queue; 10: a payload may ask for
-files of the next ones; 11: a notice may carry data."""
+files of the next ones; 11: a notice may carry data, and a refusal has `facts` for the
+attributes of its error."""
 DATUM_VERSION: Final = 1
 """Version of the encoding of data; these are stored, so old versions stay readable."""
 
@@ -55,7 +56,7 @@ TEXT_BYTES_MAX: Final = 64 << 10
 """Longest string of a header that is no name: causes, endpoints, fingerprints, reasons."""
 REPORT_FIELD_BYTES_MAX: Final = 64 << 10
 """Longest `report` that a keep-alive can have; a shard keeps one of at most
-`core.protocol.requests.REPORT_BYTES_MAX`, and counts longer ones."""
+`core.protocol.parts.REPORT_BYTES_MAX`, and counts longer ones."""
 ITEMS_MAX: Final = parts.ITEMS_MAX
 KEPT_VERSIONS_MAX: Final = 1 << 14
 """Most versions that one request pins; a shard pins at most 10,000 in all."""

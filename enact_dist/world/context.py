@@ -280,11 +280,13 @@ def watch_patterns(
     """Follow several patterns with one watch; see `WorldContext.watch`."""
     session = context.session
     session.client.check_usable()
+    aspects = tuple(aspects)
+    if aspects:
+        session.look_up(aspects)
+    names = tuple(aspect.name for aspect in aspects)
     known = {aspect.name: aspect for aspect in aspects}
-    if known:
-        session.look_up(known.values())
     read = partial(_value_of, context, known) if data else None
-    return Watch(session.client, (context.name,), tuple(patterns), tuple(known), read=read)
+    return Watch(session.client, (context.name,), tuple(patterns), names, read=read)
 
 
 def _value_of(context: WorldContext, aspects: Mapping[str, Aspect[Any]], change: Change) -> Any:

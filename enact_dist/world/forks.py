@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.access.arguments import checked_as
 from enact_dist.access.asking import ask_all, expected, present_ns
-from enact_dist.core.client.lock import OVERLOAD
 from enact_dist.core.protocol.messages import (
+    OVERLOAD,
     Dropped,
     DropWorld,
     Forgotten,

@@ -6,7 +6,6 @@ import pytest
 
 from enact_dist.core.protocol.datum import Slot
 from enact_dist.core.protocol.messages import Refused
-from enact_dist.core.rights.guard import shown
 from enact_dist.core.rights.rules import UNPROVEN, Rights
 from enact_dist.errors import LinkError, PermissionDeniedError
 from enact_dist.link.refusals import error_of
@@ -20,7 +19,7 @@ def error(right, what, subject="camera"):
 
 def test_the_error_names_subject_right_slot_and_rule():
     """In words for people, and in attributes for programs."""
-    found = error("write", shown(Slot("online", "plan/1", "joints")))
+    found = error("write", Slot("online", "plan/1", "joints"))
     assert isinstance(found, PermissionDeniedError)
     assert str(found) == (
         "camera may not write online:plan/1/joints: it declares no such request and no"
@@ -56,3 +55,14 @@ def test_another_ones_session_names_no_right():
     )
     assert isinstance(found, PermissionDeniedError)
     assert (found.identity, found.right) == ("", "")
+
+
+def test_attributes_come_from_facts_whatever_the_text_says():
+    """A text may be reworded, and a peer may send facts of any kind."""
+    world = error_of(Refused("unknown_world", "reworded", ("online", "lab")))
+    assert world.known == ("online", "lab")
+    assert error_of(Refused("clock_skew", "reworded", ("2.5",))).ahead_s == 2.5
+    for facts in ((), ("soon",)):
+        assert error_of(Refused("clock_skew", "9.9 s ahead", facts)).ahead_s == 0.0
+    right = error_of(Refused("permission", "reworded", ("cam", "read", "line 4")))
+    assert (right.identity, right.right, right.rule, right.world) == ("cam", "read", "line 4", "")

@@ -19,10 +19,10 @@ from payload_drafts import (
 )
 
 from enact_dist.core.protocol.datum import Datum
-from enact_dist.core.protocol.messages import Refused, Stage, Staged
+from enact_dist.core.protocol.messages import NO_ROOM, Refused, Stage, Staged
 from enact_dist.link.memory import payload_files, payload_handler
 from enact_dist.link.memory.maps import leftovers
-from enact_dist.link.memory.payload_handler import NO_ROOM, PayloadHandler
+from enact_dist.link.memory.payload_handler import PayloadHandler
 from enact_dist.testing import ManualClock
 
 

@@ -13,9 +13,9 @@ from payload_drafts import (
     stage,
 )
 
-from enact_dist.core.protocol.messages import Refused, Staged
+from enact_dist.core.protocol.messages import NO_ROOM, Refused, Staged
 from enact_dist.link.memory.maps import leftovers
-from enact_dist.link.memory.payload_handler import NO_ROOM, PayloadHandler
+from enact_dist.link.memory.payload_handler import PayloadHandler
 from enact_dist.testing import ManualClock
 
 

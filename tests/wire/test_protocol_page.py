@@ -15,6 +15,7 @@ import pytest
 
 from enact_dist import errors
 from enact_dist.core.protocol import messages as m
+from enact_dist.core.protocol import refused
 from enact_dist.core.protocol.datum import Datum
 from enact_dist.core.state import tenure
 from enact_dist.link.memory.use_marks import PAGE_BYTES, page_name
@@ -228,6 +229,15 @@ def test_kept_grants_have_the_figures_of_the_page():
     assert (m.NOT_KEPT, m.PROVE, m.PLACES) == (0, 1, 2)
     assert f"is {m.NOT_KEPT} (the grant is over), {m.PROVE} (it is over, and the client" in TEXT
     assert f"or {m.PLACES} + *n*: the grant stays, and cell *n*" in TEXT
+
+
+def test_codes_of_refusals_are_those_of_the_page_and_have_one_home():
+    """A code that is written out where a request is refused could be misspelt there."""
+    codes = {value for name, value in vars(refused).items() if name.isupper()}
+    assert {code for code, _, _ in table("Refusals")} == codes
+    for file in sorted(PAGE.parents[1].rglob("*.py")):
+        calls = re.findall(r"\bRefused\(\s*([^,)]*)", file.read_text("utf-8"))
+        assert [code for code in calls if '"' in code] == [], file
 
 
 def test_refusals_raise_what_the_page_says():

@@ -29,9 +29,10 @@ from enact_dist.core.client.cut import ROUNDS_MAX, Cut
 from enact_dist.core.client.finishing import Finishing, by_shard, tokens_of
 from enact_dist.core.client.kept import Keeping
 from enact_dist.core.client.plan import OF_SESSIONS, Part, Phase, Plan, Reading, first_asking
-from enact_dist.core.protocol.checks import NO_PAYLOAD
 from enact_dist.core.protocol.messages import (
+    NO_PAYLOAD,
     OUTCOME_COMMITTED,
+    OVERLOAD,
     Answer,
     Changed,
     Commit,
@@ -66,8 +67,6 @@ if TYPE_CHECKING:
 
 WAIT_SLICE_NS: Final = 900_000_000
 """How long one call of a waiting lock is parked; below the shard's own limit of 1 s."""
-OVERLOAD: Final = "overload"
-"""The code of refusals by a shard that has not looked at the request."""
 _TO_ANY_REQUEST: Final = frozenset((Refused, Forgotten, WrongShard, EpochChanged))
 _DECIDERS: Final = (Commit, Outcome)
 

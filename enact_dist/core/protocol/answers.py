@@ -23,6 +23,7 @@ from enact_dist.core.protocol.parts import (
     VersionEntry,
     WorldEntry,
 )
+from enact_dist.core.protocol.refused import Refused
 
 
 @message
@@ -360,18 +361,6 @@ class WrongShard:
     """The client placed the request by another map than the shard's."""
 
     placement: PlacementMap
-
-
-@message
-class Refused:
-    """The request cannot be executed; `code` names the error class to raise."""
-
-    code: str
-    text: str
-
-
-PERMISSION = "permission"
-"""The code of a refusal because of the sender, or for want of a right."""
 
 
 @message

@@ -9,7 +9,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.protocol.messages import Commit, Refused
+from enact_dist.core.protocol.messages import (
+    NO_PAYLOAD,
+    PROTOCOL,
+    UNKNOWN_WORLD,
+    VALUE,
+    Commit,
+    Refused,
+)
 from enact_dist.core.protocol.parts import NO_LIMIT, READS_MAX
 from enact_dist.patterns import checked_patterns
 from enact_dist.terms import Access, Durability, checked_name
@@ -22,8 +29,6 @@ if TYPE_CHECKING:
 
 WORLDS_TOLD_MAX: Final = 100
 """Most world contexts that a refusal names: a text has at most 64 KiB."""
-NO_PAYLOAD: Final = "no_payload"
-"""The code of a refusal that leaves the lock unchanged: named bytes are missing, send them."""
 
 _ACCESSES: Final = frozenset(access.value for access in Access)
 _ACCESSES_EACH: Final = frozenset(access.value for access in Access if access.each)
@@ -61,14 +66,15 @@ def wrong_name(kind: str, name: str, *, slashes: bool) -> Refused | None:
     try:
         checked_name(kind, name, slashes=slashes)
     except ValueError as error:
-        return Refused("value", str(error))
+        return Refused(VALUE, str(error))
     return None
 
 
 def unknown_world(name: str, worlds: Iterable[str]) -> Refused:
     """Refuse a world context that is not here, naming those that are."""
-    known = ", ".join(sorted(worlds)[:WORLDS_TOLD_MAX]) or "none"
-    return Refused("unknown_world", f"no world context {name!r} here; known: {known}")
+    known = tuple(sorted(worlds)[:WORLDS_TOLD_MAX])
+    text = f"no world context {name!r} here; known: {', '.join(known) or 'none'}"
+    return Refused(UNKNOWN_WORLD, text, known)
 
 
 def wrong_aspect(entry: AspectEntry) -> Refused | None:
@@ -160,4 +166,4 @@ def wrong_finish(message: Finish, primary: str) -> Refused | None:
 
 
 def _refused(text: str) -> Refused:
-    return Refused("protocol", text)
+    return Refused(PROTOCOL, text)

@@ -13,6 +13,7 @@ of these, NamedTuples and the dataclasses of this package.
     parts       the parts of several messages
     requests    the requests, each with the name of its answer, and those with pages
     answers     the answers of a shard, and its notices
+    refused     a refusal, and its codes
 
 Durations are sent, points in time are not (except wall-clock stamps): clocks are never compared.
 
@@ -28,7 +29,6 @@ from enact_dist.core.protocol.answers import (
     OUTCOME_EXPIRED,
     OUTCOME_PENDING,
     OUTCOME_UNSEEN,
-    PERMISSION,
     RESOLVED_ABORTED,
     RESOLVED_COMMITTED,
     RESOLVED_OPEN,
@@ -55,7 +55,6 @@ from enact_dist.core.protocol.answers import (
     Prepared,
     Reached,
     Refusals,
-    Refused,
     Registered,
     Released,
     Resolved,
@@ -75,6 +74,7 @@ from enact_dist.core.protocol.answers import (
 from enact_dist.core.protocol.parts import (
     CAUSE_COMMIT,
     CAUSE_FORK,
+    HOLD_NS_MAX,
     INLINE_BYTES_MAX,
     ITEMS_MAX,
     NO_LIMIT,
@@ -83,6 +83,7 @@ from enact_dist.core.protocol.parts import (
     PLACES,
     PROVE,
     READS_MAX,
+    REPORT_BYTES_MAX,
     START,
     AspectEntry,
     AuditEntry,
@@ -105,10 +106,26 @@ from enact_dist.core.protocol.parts import (
     WorldEntry,
     WriteItem,
 )
+from enact_dist.core.protocol.refused import (
+    CLOCK_SKEW,
+    DAMAGED,
+    DATUM_TYPE,
+    HELD,
+    NEWER_TYPE,
+    NO_PAYLOAD,
+    NO_ROOM,
+    NOT_PROVEN,
+    OVERLOAD,
+    PERMISSION,
+    PROTOCOL,
+    TOO_LONG,
+    UNKNOWN_ASPECT,
+    UNKNOWN_WORLD,
+    VALUE,
+    Refused,
+)
 from enact_dist.core.protocol.requests import (
-    HOLD_NS_MAX,
     PAGED,
-    REPORT_BYTES_MAX,
     Acquire,
     AwaitStamp,
     Break,

@@ -32,6 +32,10 @@ ITEMS_MAX: Final = 4096
 """Most lines of one lock and most writes of one commit.  A shard grants a lock, and applies a
 commit, in one step, which is what makes them atomic, and serves no other client meanwhile: about
 8 us for each slot, so 30 ms for so many, and half a second for 65,536."""
+HOLD_NS_MAX: Final = 24 * 3600 * 1_000_000_000
+"""A lock is held for a day at most; then the client must request it again."""
+REPORT_BYTES_MAX: Final = 4096
+"""Longest report of an actor that a shard keeps; a client refuses to send a longer one."""
 INLINE_BYTES_MAX: Final = 64 << 10
 """Data up to this size travel with their commit and their grant; larger ones are payloads, and are
 fetched when they are read."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 from enact_dist.core.protocol.datum import Datum, LockId, Position, Slot, Token, message
 from enact_dist.core.protocol.parts import (
     START,
@@ -46,10 +44,6 @@ class Register:
     session: str
     worlds: tuple[str, ...]
     aspects: tuple[AspectEntry, ...]
-
-
-HOLD_NS_MAX: Final = 24 * 3600 * 1_000_000_000
-"""A lock is held for a day at most; then the client must request it again."""
 
 
 @message
@@ -114,10 +108,6 @@ class Fetch:
     version: int
     offset: int
     length: int
-
-
-REPORT_BYTES_MAX: Final = 4096
-"""Longest report of an actor that a shard keeps; a client refuses to send a longer one."""
 
 
 @message

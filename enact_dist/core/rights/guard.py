@@ -59,7 +59,7 @@ from enact_dist.core.protocol.messages import (
     WriteItem,
 )
 from enact_dist.core.protocol.records import Content, LogEvent
-from enact_dist.core.rights.rules import ALL, UNPROVEN, WRITE, Rights, path_of
+from enact_dist.core.rights.rules import ALL, UNPROVEN, WRITE, Rights, path_of, shown
 from enact_dist.terms import ACCESSES
 
 TOLD_EACH_NS: Final = 1_000_000_000
@@ -146,7 +146,7 @@ class Guard:
             access = ACCESSES.get(item.access)
             right = WRITE if access is not None and access.writes else "read"
             if not rights.may(subject, right, f"{item.context}/{item.aspect}/{item.entity}"):
-                return self.denied(right, shown(Slot(item.context, item.entity, item.aspect)))
+                return self.denied(right, Slot(item.context, item.entity, item.aspect))
         return None
 
     def _register(self, message: Register, worlds: Collection[str]) -> Refused | None:
@@ -176,7 +176,7 @@ class Guard:
 
     def may_not_read(self, slot: Slot) -> Refused | None:
         """Refuse a slot that the present subject may not read."""
-        return self.denied("read", shown(slot)) if self.hides(slot) else None
+        return self.denied("read", slot) if self.hides(slot) else None
 
     def may_not_write(self, writes: Iterable[WriteItem], contents: SlotContents) -> Refused | None:
         """Refuse writes for which the present subject has not the right."""
@@ -185,16 +185,16 @@ class Guard:
             if datum is not None and contents[slot].datum is None:
                 right = "init"
             if not self.rights.may(self.subject, right, path_of(slot)):
-                return self.denied(right, shown(slot))
+                return self.denied(right, slot)
         return None
 
     # ---------------------------------------------------------------- people
 
-    def denied(self, right: str, what: str) -> Refused:
+    def denied(self, right: str, what: Slot | str) -> Refused:
         """Refuse a right on something, and count it."""
         self._count("permission_denied")
         refused = self.rights.refuse(self.subject, self.asker, right, what)
-        self.denials.append((self.subject, right, what, refused))
+        self.denials.append((self.subject, right, shown(what), refused))
         return refused
 
     def log_events(self, now_ns: int, wall_ns: int) -> Iterator[LogEvent]:
@@ -237,8 +237,3 @@ def _asked_alone(message: object) -> Slot | None:
             ((context,), (entity,), (aspect,)) = asked
             return Slot(context, entity, aspect)
     return None
-
-
-def shown(slot: Slot) -> str:
-    """Return a slot as rules and refusals name it."""
-    return f"{slot.context}:{slot.entity}/{slot.aspect}"

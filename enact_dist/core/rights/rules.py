@@ -36,7 +36,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.protocol.messages import PERMISSION, Refused
+from enact_dist.core.protocol.messages import NOT_PROVEN, PERMISSION, Refused
 from enact_dist.patterns import contained, container, pattern_matches, patterns_overlap
 
 if TYPE_CHECKING:
@@ -57,8 +57,6 @@ ALL: Final = "**"
 WRITE: Final = "write"
 UNPROVEN: Final = "-"
 """The subject of a client that only says its own name; no name starts with a hyphen."""
-NOT_PROVEN: Final = "unproven"
-"""The code of a refusal to a client without a proven name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,9 +216,9 @@ class Rights:
             return own if own in self.operators and name not in self.known else name
         return self.users.get(user) or (own if own in self.operators else "")
 
-    def refuse(self, subject: str, asker: str, right: str, what: str) -> Refused:
+    def refuse(self, subject: str, asker: str, right: str, what: Slot | str) -> Refused:
         """Refuse a request of `asker` that would have used the rights of `subject`."""
-        on = f" {what}" if what else ""
+        on = f" {shown(what)}" if what else ""
         if subject == UNPROVEN:
             return Refused(
                 NOT_PROVEN,
@@ -233,7 +231,13 @@ class Rights:
             PERMISSION,
             f"{subject} may not {right}{on}: it {does} and no [[rights.allow]] gives it; `enact"
             f" actor check --rights`, or add it ({self.hint})",
+            (subject, right, self.hint, *(() if isinstance(what, str) else what)),
         )
+
+
+def shown(what: Slot | str) -> str:
+    """Return what a request is about as rules and refusals name it."""
+    return what if isinstance(what, str) else f"{what.context}:{what.entity}/{what.aspect}"
 
 
 class _Given:

@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.checks import wrong_label, wrong_patterns
 from enact_dist.core.protocol.messages import (
+    NO_ROOM,
     START,
+    VALUE,
     Cursor,
     EpochChanged,
     Explain,
@@ -158,7 +160,7 @@ class LineageHandler:
 def _too_many(count: int) -> Refused | None:
     if count <= ASKED_MAX:
         return None
-    return Refused("value", f"{count} were asked about at once; at most {ASKED_MAX}")
+    return Refused(VALUE, f"{count} were asked about at once; at most {ASKED_MAX}")
 
 
 KEPT_MAX: Final = 10_000
@@ -276,7 +278,7 @@ class HistoryHandler:
         if not message.versions or (kept <= KEPT_MAX and history.kept_bytes <= KEPT_BYTES_MAX):
             return None
         return Refused(
-            "no_room",
+            NO_ROOM,
             f"{len(message.versions)} versions were to be kept as {message.label!r}; with them"
             f" {kept} would be kept here, now of {history.kept_bytes} bytes; at most {KEPT_MAX} of"
             f" {KEPT_BYTES_MAX} bytes can be; release labels that are not needed",

@@ -8,7 +8,12 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.core.protocol.checks import unknown_world, wrong_access
 from enact_dist.core.protocol.datum import Column, Datum, LockId, Slot
 from enact_dist.core.protocol.messages import (
+    DAMAGED,
     ITEMS_MAX,
+    NEWER_TYPE,
+    OVERLOAD,
+    UNKNOWN_ASPECT,
+    VALUE,
     Acquire,
     Answer,
     EpochChanged,
@@ -38,10 +43,6 @@ LOCKS_MAX: Final = 100_000
 """Locks, granted or waiting, at one shard."""
 LOOKED_MAX: Final = 1_000_000
 """Slots that the patterns of one lock or view may have to look at, if there are several."""
-NEWER_TYPE: Final = "newer_type"
-"""The code of a refusal until the client has looked at the types of the shard's aspects again."""
-DAMAGED: Final = "damaged"
-"""The code of a refusal because the stored bytes of a datum are not what was stored."""
 
 
 class LockHandler:
@@ -64,7 +65,7 @@ class LockHandler:
             return [Reply(reply_to, refusal)]
         if session.observer:
             text = "this session only observes and cannot lock; connect without observer=True"
-            return [Reply(reply_to, Refused("value", text))]
+            return [Reply(reply_to, Refused(VALUE, text))]
         session.renew(state.now_ns, message.count)
         tenure = tenures.by_lock.get(lock)
         if tenure is None:
@@ -124,7 +125,7 @@ class LockHandler:
         strange = [seen.slot for seen in message.seen if tuple(seen.slot) not in locked]
         if strange:
             text = f"{strange[0]} was seen and is not requested; a lock waits for news of its data"
-            return [Reply(reply_to, Refused("value", text))]
+            return [Reply(reply_to, Refused(VALUE, text))]
         identity = session.identity
         if identity and standing.count_of(identity) >= owners.WAITERS_MAX:
             bound = f"{owners.WAITERS_MAX} locks that wait for news"
@@ -179,7 +180,7 @@ class LockHandler:
             return [Reply(reply_to, Stale(lock, state.epoch))]
         if lock.lane not in lanes:
             if len(lanes) >= LANES_MAX:
-                return [Reply(reply_to, Refused("overload", f"{LANES_MAX} lanes in one session"))]
+                return [Reply(reply_to, Refused(OVERLOAD, f"{LANES_MAX} lanes in one session"))]
         elif lock.seq <= lanes[lock.lane].top:
             state.count("stale")
             return [Reply(reply_to, Stale(lock, state.epoch))]
@@ -234,10 +235,10 @@ class LockHandler:
             state.count("wrong_shard")
             return WrongShard(state.settings.placement)
         if len(state.tenures.by_lock) >= LOCKS_MAX:
-            return Refused("overload", f"{LOCKS_MAX} locks are held or awaited here")
+            return Refused(OVERLOAD, f"{LOCKS_MAX} locks are held or awaited here")
         if shape is None or shape.patterns > 1:
             if len(items) > ITEMS_MAX:
-                return Refused("value", f"{len(items)} requests in one lock; at most {ITEMS_MAX}")
+                return Refused(VALUE, f"{len(items)} requests in one lock; at most {ITEMS_MAX}")
             wrong = wrong_access(items) or self._too_much_to_look_at(items)
             if wrong is not None:
                 return wrong
@@ -248,7 +249,7 @@ class LockHandler:
                 return unknown_world(item.context, worlds)
             if item.aspect not in aspects and ACCESSES[item.access].writes:
                 # Reading an unregistered aspect is no fault: its slots are null.
-                return Refused("unknown_aspect", f"aspect {item.aspect!r} is not registered here")
+                return Refused(UNKNOWN_ASPECT, f"aspect {item.aspect!r} is not registered here")
         return None
 
     def _too_much_to_look_at(self, items: tuple[Item, ...]) -> Refused | None:
@@ -259,7 +260,7 @@ class LockHandler:
         if looked <= LOOKED_MAX:
             return None
         return Refused(
-            "value",
+            VALUE,
             f"{len(columns)} patterns in one lock would look at {looked} slots; at most"
             f" {LOOKED_MAX}; ask for the entities by name, or with fewer patterns",
         )

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.checks import wrong_aspect, wrong_name
 from enact_dist.core.protocol.messages import (
+    DATUM_TYPE,
+    OVERLOAD,
     REPORT_BYTES_MAX,
     Alive,
     Answer,
@@ -69,9 +71,7 @@ class SessionHandler:
                 yield from self._state.quotas.refuse(reply_to, asker, bound)
                 return
             if sessions.full(self._state.now_ns) and not (yield from self._make_room()):
-                yield Reply(
-                    reply_to, Refused("overload", f"{len(sessions.by_id)} sessions are open")
-                )
+                yield Reply(reply_to, Refused(OVERLOAD, f"{len(sessions.by_id)} sessions are open"))
                 return
         ttl_ns = max(TTL_NS_MIN, min(message.ttl_ns, self._state.settings.ttl_ns_max))
         session, unrecorded = self._state.sessions.hello(
@@ -167,7 +167,7 @@ class SessionHandler:
             alters = guard is None or not entry.reads or guard.may_alter(entry.name)
             registered = catalogue.register(entry, alters=alters) if wrong is None else wrong
             if isinstance(registered, str):
-                registered = Refused("datum_type", registered)
+                registered = Refused(DATUM_TYPE, registered)
             if isinstance(registered, Refused):
                 catalogue.put_back(before)
                 yield Reply(reply_to, registered)

@@ -24,6 +24,8 @@ from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeVar
 from enact_dist.core.protocol.checks import unknown_world
 from enact_dist.core.protocol.datum import Column, Slot
 from enact_dist.core.protocol.messages import (
+    CLOCK_SKEW,
+    PROTOCOL,
     AwaitStamp,
     EpochChanged,
     Forgotten,
@@ -166,7 +168,7 @@ class ViewHandler:
             return
         if message.at_ns < 0:
             yield Reply(
-                reply_to, Refused("protocol", f"stamp {message.at_ns} was asked, which is none")
+                reply_to, Refused(PROTOCOL, f"stamp {message.at_ns} was asked, which is none")
             )
             return
         if message.strict and state.stamps.too_far_ahead(message.at_ns, wall_ns=state.wall_ns):
@@ -198,9 +200,10 @@ class ViewHandler:
     def _in_the_future(self, at_ns: int) -> Refused:
         ahead_s = (at_ns - self._state.wall_ns) / 1e9
         return Refused(
-            "clock_skew",
+            CLOCK_SKEW,
             f"the data were asked as of a time {ahead_s:.1f} s ahead of the clock of shard"
             f" {self._state.settings.name}; at most 1 s is accepted; ask for a time that has come",
+            (str(ahead_s),),
         )
 
     def _undecided_ns(self, items: tuple[Item, ...]) -> int:

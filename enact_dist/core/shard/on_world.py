@@ -28,6 +28,11 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.core.protocol.checks import unknown_world, wrong_name
 from enact_dist.core.protocol.datum import LockId, Slot
 from enact_dist.core.protocol.messages import (
+    CLOCK_SKEW,
+    HELD,
+    OVERLOAD,
+    PROTOCOL,
+    VALUE,
     Cause,
     DatumRead,
     Dropped,
@@ -117,7 +122,7 @@ class WorldHandler:
             return
         if len(self._waiting) >= WAITING_MAX:
             text = f"{WAITING_MAX} forks wait for commits to be decided; ask again"
-            yield from self._told(act, Refused("overload", text))
+            yield from self._told(act, Refused(OVERLOAD, text))
             return
         self._state.stamp(message.at_ns)
         self._state.busy_worlds[message.world] = f"being forked from {message.source!r}"
@@ -138,7 +143,7 @@ class WorldHandler:
             return self._forked(world)
         if there is not None:
             return Refused(
-                "value",
+                VALUE,
                 f"world context {world!r} was to be forked from {message.source!r} as of stamp"
                 f" {message.at_ns}, and {_told_of(there)}; take another name, or drop it first",
             )
@@ -146,17 +151,18 @@ class WorldHandler:
             return unknown_world(message.source, state.catalogue.worlds)
         if message.at_ns <= 0:
             text = f"{message.source!r} was to be forked as of stamp {message.at_ns}, which is none"
-            return Refused("protocol", text)
+            return Refused(PROTOCOL, text)
         full = state.catalogue.room_for_world(WorldEntry(*_fork_of(message)))
         if full is not None:
             return full
         if state.stamps.too_far_ahead(message.at_ns, wall_ns=state.wall_ns):
             ahead_s = (message.at_ns - state.wall_ns) / 1e9
             return Refused(
-                "clock_skew",
+                CLOCK_SKEW,
                 f"{message.source!r} was to be forked as of a stamp {ahead_s:.1f} s ahead of the"
                 f" clock of shard {state.settings.name}, where at most {AHEAD_NS_MAX / 1e9:g} s are"
                 " accepted; name a time that has passed, or set the clocks of both hosts",
+                (str(ahead_s),),
             )
         return None
 
@@ -183,7 +189,7 @@ class WorldHandler:
             elif act.wait_end_ns <= self._state.now_ns or self._state.draining:
                 self._end(act)
                 text = f"commits on {message.source!r} up to stamp {message.at_ns} are undecided"
-                yield from self._told(act, Refused("overload", f"{text}; ask again"))
+                yield from self._told(act, Refused(OVERLOAD, f"{text}; ask again"))
 
     def _make(self, act: _Act) -> Iterator[Effect]:
         """Hand a fork to the store."""
@@ -255,13 +261,13 @@ class WorldHandler:
         forks = [act.message for act in (*self._waiting.values(), *self._at_store.values())]
         fork = next((one for one in forks if isinstance(one, Fork) and one.source == world), None)
         if fork is not None:
-            return Refused("overload", f"{asked}, and is being forked to {fork.world!r}; ask again")
+            return Refused(OVERLOAD, f"{asked}, and is being forked to {fork.world!r}; ask again")
         if state.busy_world(world) is not None:
             return state.busy_world(world)
         if world not in state.catalogue.worlds:
             return Dropped(world, 0)
         if world in state.settings.worlds:
-            return Refused("value", f"{asked}, and stands in cell.toml; take it out there first")
+            return Refused(VALUE, f"{asked}, and stands in cell.toml; take it out there first")
         for tenure in list(state.tenures.kept.by_number.values()):
             if any(item.context == world for item in tenure.items):
                 state.tenures.kept.recall(tenure, now_ns=state.now_ns)
@@ -271,7 +277,7 @@ class WorldHandler:
                 holder = state.tenures.describe(tenure, state.now_ns)
                 verb = "holds" if holder.granted else "waits for"
                 return Refused(
-                    "held",
+                    HELD,
                     f"{asked}; lock {holder.number} of {holder.actor or 'client'}@{holder.host}"
                     f" pid {holder.pid} {verb} {item.entity}/{item.aspect} in it for"
                     f" {holder.age_ns / 1e9:.1f} s; wait for its end, or break it",

@@ -30,7 +30,9 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Final, get_args
 
 from enact_dist.core.protocol.messages import (
+    OVERLOAD,
     PERMISSION,
+    PROTOCOL,
     Break,
     DropWorld,
     EpochChanged,
@@ -120,7 +122,7 @@ def _says_epoch(message: Request | Event) -> Refused | None:
     if message.epoch:  # type: ignore[union-attr]  # those that have to say it have one
         return None
     kind = type(message).__name__
-    return Refused("protocol", f"a {kind} came that names no epoch of this shard")
+    return Refused(PROTOCOL, f"a {kind} came that names no epoch of this shard")
 
 
 def not_yours(session: str, owner: str, asker: str) -> Refused:
@@ -160,4 +162,4 @@ class Quotas:
         if identity not in self._told and len(self._told) < TOLD_MAX:
             self._told.add(identity)
             yield LogEvent("quota.refused", f"{text}; further refusals are only counted")
-        yield Reply(reply_to, Refused("overload", f"{text}; end some, or wait for their end"))
+        yield Reply(reply_to, Refused(OVERLOAD, f"{text}; end some, or wait for their end"))

@@ -20,6 +20,7 @@ from typing import Final, cast
 from enact_dist.core.protocol.checks import wrong_patterns
 from enact_dist.core.protocol.messages import (
     PAGED,
+    VALUE,
     Acquire,
     AwaitStamp,
     Break,
@@ -454,7 +455,7 @@ class Shard:
         yield from tell(reply_to, broken, (kept,), Durability.OS)
 
     def _on_stage(self, _: Stage, reply_to: int) -> Iterator[Effect]:
-        yield Reply(reply_to, Refused("value", "this shard takes no data ahead of their commit"))
+        yield Reply(reply_to, Refused(VALUE, "this shard takes no data ahead of their commit"))
 
     def _on_list_audit(self, message: ListAudit, reply_to: int) -> Iterator[Effect]:
         audit = self.state.audit

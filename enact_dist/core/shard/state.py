@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.messages import (
     NO_PLACE,
+    OVERLOAD,
     AspectEntry,
     Broken,
     EpochChanged,
@@ -406,7 +407,7 @@ class ShardState:
             return None
         if message.count == count:
             return answer
-        return Refused("overload", "the request came after a newer one of its session; ask again")
+        return Refused(OVERLOAD, "the request came after a newer one of its session; ask again")
 
     def remember_answer(self, message: Fork | DropWorld | KeepVersions, answer: Answer) -> None:
         """Let a copy of a request be answered as the request was."""
@@ -444,7 +445,7 @@ class ShardState:
         act = self.busy_worlds.get(world)
         if act is None:
             return None
-        return Refused("overload", f"world context {world!r} is {act}; ask again")
+        return Refused(OVERLOAD, f"world context {world!r} is {act}; ask again")
 
     def numbered(self, number: int, epoch: int) -> Tenure | None:
         """Return the lock with a number that people saw in an epoch (0: this one)."""

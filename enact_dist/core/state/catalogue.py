@@ -11,7 +11,14 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Final, NamedTuple, TypeVar
 
 from enact_dist.core.protocol.datum_types import type_conflict, with_type_of
-from enact_dist.core.protocol.messages import AspectEntry, Refused, WorldEntry, WriteItem
+from enact_dist.core.protocol.messages import (
+    NO_ROOM,
+    OVERLOAD,
+    AspectEntry,
+    Refused,
+    WorldEntry,
+    WriteItem,
+)
 from enact_dist.core.protocol.pages import bytes_in_frame
 from enact_dist.core.state.history import Policy
 from enact_dist.core.state.retention import covers, limits_of, with_larger
@@ -189,7 +196,7 @@ class Catalogue:
         if len(self.worlds) < WORLDS_MAX and size <= CATALOGUE_BYTES_MAX:
             return None
         return Refused(
-            "no_room",
+            NO_ROOM,
             f"asked to add {world.name!r} to the {len(self.worlds)} world contexts that are here;"
             f" at most {WORLDS_MAX}, of {CATALOGUE_BYTES_MAX} bytes with all aspects; {REMEDY}",
         )
@@ -275,7 +282,7 @@ def _that_fit(entries: Iterable[E], bytes_of: Callable[[E], int], most: int) -> 
 
 
 def _too_much(what: str) -> Refused:
-    return Refused("overload", f"asked to add {what}; {REMEDY}")
+    return Refused(OVERLOAD, f"asked to add {what}; {REMEDY}")
 
 
 _DURABILITIES: Final = {durability.value: durability for durability in Durability}

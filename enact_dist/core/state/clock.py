@@ -15,7 +15,7 @@ from bisect import bisect_left
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
-from enact_dist.core.protocol.messages import Refused
+from enact_dist.core.protocol.messages import CLOCK_SKEW, PROTOCOL, Refused
 
 if TYPE_CHECKING:
     from enact_dist.core.protocol.datum import LockId, Position, Token
@@ -175,7 +175,7 @@ def wrong_decision(
     """
     if position.stamp_ns <= 0:
         return Refused(
-            "protocol",
+            PROTOCOL,
             f"{lock} is said to be committed at stamp {position.stamp_ns}, which is none",
         )
     after_promise = position.stamp_ns <= stamps.last_ns + AHEAD_NS_MAX
@@ -183,10 +183,11 @@ def wrong_decision(
         return None
     ahead_s = (position.stamp_ns - wall_ns) / 1e9
     return Refused(
-        "clock_skew",
+        CLOCK_SKEW,
         f"shard {position.shard} has committed {lock} with a stamp {ahead_s:.1f} s ahead of the"
         " clock of this shard; at most 1 s is accepted; set the clocks of both hosts, then the"
         " commit is finished here, too",
+        (str(ahead_s),),
     )
 
 

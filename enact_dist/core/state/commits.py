@@ -29,18 +29,17 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.protocol.checks import (
-    NO_PAYLOAD,
-    missing_payload,
-    wrong_commit,
-    wrong_name,
-)
+from enact_dist.core.protocol.checks import missing_payload, wrong_commit, wrong_name
 from enact_dist.core.protocol.datum import LockId, Position, Slot, Token
 from enact_dist.core.protocol.messages import (
+    CLOCK_SKEW,
+    NO_PAYLOAD,
     OUTCOME_COMMITTED,
     OUTCOME_EXPIRED,
     OUTCOME_PENDING,
     OUTCOME_UNSEEN,
+    OVERLOAD,
+    PROTOCOL,
     Cause,
     Changed,
     Commit,
@@ -382,13 +381,13 @@ class Commits:
         if wrong is not None:
             return wrong
         if tenure.committing or tenure.prepared is not None:
-            return Refused("protocol", f"{message.lock} is being committed in another way")
+            return Refused(PROTOCOL, f"{message.lock} is being committed in another way")
         wants, writes, whole = tenure.claim.wants, message.writes, True
         for slot, datum in writes:
             if datum is not None and len(datum.body) != datum.size:
                 whole = False
             if not (slot in wants and wants[slot] is X) and not tenure.covers(slot):
-                return Refused("protocol", f"{message.lock} does not hold {slot} for writing")
+                return Refused(PROTOCOL, f"{message.lock} does not hold {slot} for writing")
         if self._guard is not None and (denied := self._guard.may_not_write(writes, self._slots)):
             return denied
         if new:
@@ -401,9 +400,10 @@ class Commits:
         if seen_ns > wall_ns and self._stamps.too_far_ahead(seen_ns, wall_ns=wall_ns):
             ahead_s = (seen_ns - wall_ns) / 1e9
             return Refused(
-                "clock_skew",
+                CLOCK_SKEW,
                 f"the client has seen a commit stamped {ahead_s:.1f} s ahead of the clock of shard"
                 f" {self._shard}; at most 1 s is accepted; set the clocks of both hosts",
+                (str(ahead_s),),
             )
         return None if whole else missing_payload(writes)
 
@@ -425,7 +425,7 @@ class Commits:
             if lane is not None and lock.seq <= lane.top:  # late: what it was built on may be gone
                 return self._tenures.fenced(lock, token)
             if lane is None and len(session.lanes) >= LANES_MAX:
-                return Refused("overload", f"{LANES_MAX} lanes in one session")
+                return Refused(OVERLOAD, f"{LANES_MAX} lanes in one session")
         return None
 
     # ---------------------------------------------------------------- validate, outcome

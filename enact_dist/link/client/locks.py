@@ -20,9 +20,11 @@ from enact_dist.core.client.kept import Keeping
 from enact_dist.core.client.lock import MultiLock
 from enact_dist.core.client.plan import AwaitedNews, Phase
 from enact_dist.core.protocol.messages import (
+    NEWER_TYPE,
     OUTCOME_COMMITTED,
     OUTCOME_PENDING,
     OUTCOME_UNSEEN,
+    UNKNOWN_ASPECT,
     Commit,
     Explain,
     Outcome,
@@ -33,7 +35,6 @@ from enact_dist.core.protocol.messages import (
     Versions,
 )
 from enact_dist.core.protocol.placement import shard_of
-from enact_dist.core.shard.on_lock import NEWER_TYPE
 from enact_dist.core.state.clock import is_kept
 from enact_dist.errors import CommitUnknownError, EnactError, MisuseError
 from enact_dist.link.client.calls import BYTES_PER_S_MIN, CALL_S, attempt_timeout_s, bytes_with
@@ -212,7 +213,7 @@ class CellClient(SessionClient):
                 self._pause(min(0.02 * 2 ** min(attempt, 8), RESTART_S_MAX))
             return True
         code = lock.refusal.code if isinstance(lock.refusal, Refused) else ""
-        if code not in ("unknown_aspect", NEWER_TYPE) or attempt >= REGISTRATIONS_MAX:
+        if code not in (UNKNOWN_ASPECT, NEWER_TYPE) or attempt >= REGISTRATIONS_MAX:
             return False
         shards = {shard for shard, _ in (*lock.plan.locks, *lock.plan.views)}
         if code == NEWER_TYPE:

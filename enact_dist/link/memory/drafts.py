@@ -7,7 +7,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.protocol.messages import Refused
+from enact_dist.core.protocol.messages import NO_ROOM, Refused
 from enact_dist.wire.limits import PAYLOAD_BYTES_MIN
 
 if TYPE_CHECKING:
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
 DRAFT_BYTES_MAX: Final = 2 << 30
 """Bytes of drafts in plain memory that may wait for their commits."""
-NO_ROOM: Final = "no_room"
-"""The code of a refusal for lack of room."""
 SHARES: Final = 4
 """Each client always has a quarter of the room for drafts; more only while others need none."""
 

@@ -20,10 +20,9 @@ import weakref
 from typing import TYPE_CHECKING, Any, Final
 
 from enact_dist.core.protocol.datum import Datum
-from enact_dist.core.protocol.messages import Refused, Stage, Staged
+from enact_dist.core.protocol.messages import NO_ROOM, Refused, Stage, Staged
 from enact_dist.errors import EnactError
 from enact_dist.link.memory.ahead import NamesAhead
-from enact_dist.link.memory.drafts import NO_ROOM
 from enact_dist.link.memory.maps import (
     Pages,
     anonymous_file,

@@ -32,12 +32,11 @@ from errno import EEXIST
 from functools import partial
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from enact_dist.core.protocol.messages import Refused, Staged, WriteItem
+from enact_dist.core.protocol.messages import NO_ROOM, PROTOCOL, Refused, Staged, WriteItem
 from enact_dist.link.clock import Clock, SystemClock
 from enact_dist.link.memory.ahead import BYTES_MAX, FILES_MAX, AheadOf
 from enact_dist.link.memory.drafts import (
     DRAFT_BYTES_MAX,
-    NO_ROOM,
     Drafted,
     beyond_share,
     given_up,
@@ -131,7 +130,7 @@ class PayloadHandler:
         """
         file, total = message.file, message.total
         if not PAYLOAD_NAME.match(file) or not file.startswith(f"{message.session}-"):
-            return Refused("protocol", f"{file[:80]!r} is no payload of session {message.session}")
+            return Refused(PROTOCOL, f"{file[:80]!r} is no payload of session {message.session}")
         if not total:
             self.drop(file)
             return Staged(file, 0, shared=False)
@@ -139,7 +138,7 @@ class PayloadHandler:
             if file in self._over:
                 return Staged(file, total, False)  # a late copy that no client waits for
         if not 0 < total <= BODY_BYTES_MAX:
-            return Refused("protocol", f"a payload of {total} bytes; at most {BODY_BYTES_MAX}")
+            return Refused(PROTOCOL, f"a payload of {total} bytes; at most {BODY_BYTES_MAX}")
         draft: Drafted | Refused | None = self._drafts.get(file)
         if draft is None:
             # Slices of one draft may come from several threads.
@@ -150,7 +149,7 @@ class PayloadHandler:
         if not isinstance(draft, Drafted):
             return draft or Staged(file, total, False)
         if draft.size != total:
-            return Refused("protocol", f"payload {file} has {draft.size} bytes, not {total}")
+            return Refused(PROTOCOL, f"payload {file} has {draft.size} bytes, not {total}")
         if not draft.asked or message.ahead != draft.ahead:
             draft.asked, draft.ahead = True, message.ahead if draft.shared else 0
             self._want(file, draft)
@@ -233,11 +232,9 @@ class PayloadHandler:
     def _take(self, file: str, draft: Drafted, offset: int, slice_: Datum) -> Staged | Refused:
         end = offset + slice_.size
         if not 0 <= offset <= end <= draft.size:
-            return Refused(
-                "protocol", f"a slice up to {end} of payload {file} of {draft.size} bytes"
-            )
+            return Refused(PROTOCOL, f"a slice up to {end} of payload {file} of {draft.size} bytes")
         if len(draft.beyond) >= GAPS_MAX:
-            return Refused("protocol", f"{GAPS_MAX} slices of payload {file} came ahead of others")
+            return Refused(PROTOCOL, f"{GAPS_MAX} slices of payload {file} came ahead of others")
         with self._mutex:
             draft.touched_ns = self._clock.monotonic_ns()
             if self._drafts.get(file) is not draft:

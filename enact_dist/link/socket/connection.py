@@ -15,6 +15,7 @@ from typing import Final, Protocol
 from enact_dist.core.protocol.datum import Slot
 from enact_dist.core.protocol.messages import (
     PERMISSION,
+    PROTOCOL,
     Answer,
     Hello,
     Outcome,
@@ -169,7 +170,7 @@ class SocketConnection:
             except ProtocolError as error:
                 host.count("frames_refused")
                 self.step = step = step + 1
-                self._send(Refused("protocol", str(error)))
+                self._send(Refused(PROTOCOL, str(error)))
                 continue
             name = SESSION_OF[type(message)]
             session = name(message) if name is not None else ""

@@ -30,6 +30,7 @@ import zenoh
 
 from enact_dist.core.protocol.messages import (
     PERMISSION,
+    PROTOCOL,
     Answer,
     Fetch,
     Hello,
@@ -296,7 +297,7 @@ class ZenohService:
             call = _Call(self, query, key)
             if _answerable(key):
                 denied = isinstance(error, PermissionDeniedError)
-                call(Refused(PERMISSION if denied else "protocol", str(error)))
+                call(Refused(PERMISSION if denied else PROTOCOL, str(error)))
             else:
                 call.drop()
             return

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from enact_dist.core.client.plan import Phase
-from enact_dist.core.protocol.messages import Forgotten
+from enact_dist.core.protocol.messages import CLOCK_SKEW, Forgotten
 from enact_dist.terms import Durability
 from enact_dist.verify.simulation.cells import CONTEXTS
 from enact_dist.verify.simulation.judges.history import TOLD_NOT, Entry, conflict
@@ -114,7 +114,7 @@ class ClientJudge:
         self._world.tally[f"told: {entry.told.value if entry.told else '-'}"] += 1
         applied = any(entry.id in picture.applied for picture in self._observed.pictures.values())
         refusal = entry.lock.refusal
-        skewed = self._observed.clocks_were_set and getattr(refusal, "code", "") == "clock_skew"
+        skewed = self._observed.clocks_were_set and getattr(refusal, "code", "") == CLOCK_SKEW
         explained = skewed or isinstance(refusal, Forgotten) or self._growth.explains(entry)
         if refusal is not None and not explained:
             self._fail("nothing is refused", entry.id, refusal)

@@ -8,9 +8,16 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.datum_types import succeeds
-from enact_dist.core.protocol.messages import Acquire, Refused, Register, Registered, Welcome
+from enact_dist.core.protocol.messages import (
+    DATUM_TYPE,
+    NEWER_TYPE,
+    Acquire,
+    Refused,
+    Register,
+    Registered,
+    Welcome,
+)
 from enact_dist.core.protocol.records import Reply
-from enact_dist.core.shard.on_lock import NEWER_TYPE
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -85,7 +92,7 @@ class GrowthJudge:
         if isinstance(asked, Acquire) and answer.code == NEWER_TYPE:
             if asked.successions == host.shard.state.catalogue.successions:
                 self._fail("a writer of the newer type is let in", shard, asked, answer)
-        elif isinstance(asked, Register) and answer.code == "datum_type":
+        elif isinstance(asked, Register) and answer.code == DATUM_TYPE:
             older = [e for e in asked.aspects if not e.reads and e.fingerprint == OLDER]
             if not older:
                 self._fail("a writer of the newer type is let in", shard, asked, answer)
@@ -116,7 +123,7 @@ class GrowthJudge:
 
     def client_refused(self, host: ClientNode, entry: AspectEntry, answer: Refused) -> None:
         """A client was refused what it would write."""
-        if entry.fingerprint != OLDER or answer.code != "datum_type":
+        if entry.fingerprint != OLDER or answer.code != DATUM_TYPE:
             self._fail("nothing is refused", host.name, entry, answer)
         self._world.tally["writers of an older type refused"] += 1
 

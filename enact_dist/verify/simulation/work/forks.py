@@ -9,8 +9,10 @@ from __future__ import annotations
 from random import Random
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.client.lock import OVERLOAD
 from enact_dist.core.protocol.messages import (
+    CLOCK_SKEW,
+    HELD,
+    OVERLOAD,
     AwaitStamp,
     Dropped,
     DropWorld,
@@ -110,7 +112,7 @@ class Forker:
             if isinstance(answer, Forgotten):
                 self._world.tally["forks of what is forgotten"] += 1
             elif isinstance(answer, Refused) and not (
-                answer.code == "clock_skew" and self._model.clocks_were_set
+                answer.code == CLOCK_SKEW and self._model.clocks_were_set
             ):
                 self._world.violation("no fork is refused", answer)
         if all(made):
@@ -146,7 +148,7 @@ class Forker:
                 count = client.sendings.next(host.local_ns)
                 request = DropWorld(client.session, name, client.epoch(shard.name), count)
                 (answer,) = yield ParallelCalls([(shard.name, request)])
-                held = isinstance(answer, Refused) and answer.code == "held"
+                held = isinstance(answer, Refused) and answer.code == HELD
                 self._world.tally["drops refused for a lock"] += held
 
         item = Item(Access.READ, name, luck.choice(ENTITIES), "count")
@@ -185,7 +187,7 @@ class Forker:
                     break
             if isinstance(answer, EpochChanged):
                 client.answered(shard, request, answer, host.local_ns)
-            elif isinstance(answer, Refused) and answer.code in (OVERLOAD, "held"):
+            elif isinstance(answer, Refused) and answer.code in (OVERLOAD, HELD):
                 yield Sleep(100 * MS)
             elif answer is not None:
                 return answer

@@ -14,9 +14,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from enact_dist.core.protocol.messages import AspectEntry, Refused, Register, Request
+from enact_dist.core.protocol.messages import NEWER_TYPE, AspectEntry, Refused, Register, Request
 from enact_dist.core.protocol.placement import shard_of
-from enact_dist.core.shard.on_lock import NEWER_TYPE
 from enact_dist.terms import Access
 from enact_dist.verify.simulation.hosts.client_host import ClientNode, ParallelCalls, Sleep, Steps
 from enact_dist.verify.simulation.hosts.world import MS, S
