@@ -15,12 +15,11 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from actors.workcell.cameras.sources import (
     FRAME_S,
-    PERIOD_NS,
     CameraEndedError,
     CameraError,
     source_of,
 )
-from actors.workcell.vocabulary import CALIBRATION, CAMERAS, IMAGE, PERIOD_S
+from actors.workcell.vocabulary import CALIBRATION, CAMERAS, IMAGE, PERIOD_NS, PERIOD_S
 from enact_dist import Actor, Lock, View, World, Write
 
 if TYPE_CHECKING:

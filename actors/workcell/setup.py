@@ -24,7 +24,7 @@ from actors.workcell.vocabulary import (
     GRID,
     MODEL,
     OBSTACLES,
-    PERIOD_S,
+    PERIOD_NS,
     PLAYING,
     ROBOT,
     SCENARIO,
@@ -50,8 +50,6 @@ GOALS_RAD: Final = (
     (0.9, 0.9, 0.0, -1.1, 0.0, 1.1, 0.0),
 )
 """Over the front of the table, and over its back."""
-PERIOD_NS: Final = round(PERIOD_S * 1e9)
-"""A scenario begins at a tick, so that its images show its seconds 0, 0.1, 0.2 …"""
 DWELL_S: Final = 0.4
 """How long the tool stays at each goal."""
 

@@ -46,6 +46,7 @@ CAMERA_COUNT: Final = 8
 """Cameras of the cell in its delivered configuration."""
 PERIOD_S: Final = 0.1
 """Period of the capture and of all that follows from it."""
+PERIOD_NS: Final = round(PERIOD_S * 1e9)
 SET_BACK_NS: Final = 1_000_000_000
 """Stamps that fall by more are of a clock that was set back; what is known by it begins anew."""
 IMAGES_COMPARED: Final = 4

@@ -15,8 +15,8 @@ import numpy as np
 
 from actors.geometry.cameras.charuco import find_board
 from actors.geometry.files import write_whole
-from actors.workcell.cameras.sources import PERIOD_NS, CameraError, source_of
-from actors.workcell.vocabulary import Calibration
+from actors.workcell.cameras.sources import CameraError, source_of
+from actors.workcell.vocabulary import PERIOD_NS, Calibration
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence

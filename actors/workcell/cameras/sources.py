@@ -30,7 +30,7 @@ from urllib.parse import parse_qsl
 
 import numpy as np
 
-from actors.workcell.vocabulary import PERIOD_S
+from actors.workcell.vocabulary import PERIOD_NS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -43,7 +43,6 @@ if TYPE_CHECKING:
 
 ENDINGS: Final = (".png", ".jpg", ".jpeg", ".ppm", ".pgm")
 """Files of a folder that are images."""
-PERIOD_NS: Final = round(PERIOD_S * 1e9)
 FRAME_S: Final = 1.0
 """A source that gives no image for so long hangs, unless it says by `frame_s` that it may."""
 _VIDEO: Final = "actors.workcell.cameras.video"

@@ -17,14 +17,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from actors.workcell.cameras.sources import (
-    PERIOD_NS,
     CameraEndedError,
     CameraError,
     check_options,
     check_size,
     number_option,
 )
-from actors.workcell.vocabulary import PERIOD_S
+from actors.workcell.vocabulary import PERIOD_NS, PERIOD_S
 
 if TYPE_CHECKING:
     import numpy as np

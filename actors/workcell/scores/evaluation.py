@@ -30,7 +30,8 @@ from actors.workcell.scores.reaction import reaction_of
 from actors.workcell.scores.trace import T, trace_of
 from actors.workcell.scores.track_scores import track_samples
 from actors.workcell.scores.true_hull import TrueVoxels
-from actors.workcell.scores.truth_of_run import PERIOD_NS, Truth, share_of, too_fast_of, truth_of
+from actors.workcell.scores.truth_of_run import Truth, share_of, too_fast_of, truth_of
+from actors.workcell.vocabulary import PERIOD_NS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -20,7 +20,8 @@ from actors.geometry.pictures.mesh_picture import viewpoint
 from actors.geometry.pictures.picture import png_bytes, tiles, with_label
 from actors.workcell import vocabulary as words
 from actors.workcell.scores.plots import ARM, plan_figure, timeline_figure
-from actors.workcell.scores.truth_of_run import PERIOD_NS, truth_of
+from actors.workcell.scores.truth_of_run import truth_of
+from actors.workcell.vocabulary import PERIOD_NS
 from enact_dist.actor.check import declarations_of
 from enact_dist.actor.graph import graph_of, svg_of
 from enact_dist.config.read import load_config

@@ -14,7 +14,8 @@ from actors.workcell import vocabulary as words
 from actors.workcell.motion import BRAKING_M_S2, NOMINAL_M_S, ROBOT_S
 from actors.workcell.scenarios import scenario_of
 from actors.workcell.scores.trace import TRUTH
-from actors.workcell.scores.truth_of_run import PERIOD_NS, truth_of
+from actors.workcell.scores.truth_of_run import truth_of
+from actors.workcell.vocabulary import PERIOD_NS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

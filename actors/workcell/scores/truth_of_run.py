@@ -29,7 +29,6 @@ RESTING_M_S: Final = 0.02
 """Slower than this the arm is at rest: what the limit of jerk leaves at the end of a stop."""
 AHEAD_S: Final = 0.5
 """How far ahead a prediction is scored."""
-PERIOD_NS: Final = round(words.PERIOD_S * 1e9)
 SILENT_NS: Final = 250_000_000
 """After so long without a command the robot brakes, whatever the last one was."""
 
@@ -65,7 +64,7 @@ class Truth:
 
     def covers(self, stamp_ns: int) -> bool:
         """Say whether a stamp lies in the scenario."""
-        return 0 <= stamp_ns - self.start_ns < self.ticks * PERIOD_NS
+        return 0 <= stamp_ns - self.start_ns < self.ticks * words.PERIOD_NS
 
     def at_s(self, stamp_ns: int) -> float:
         """Return the second of the scenario."""
@@ -217,7 +216,7 @@ def share_of(trace: Trace, truth: Truth) -> F64:
         return np.empty(0)
     received_ns = np.array([one.received_ns for one in done], np.int64)
     result: list[float] = []
-    for at_ns in truth.start_ns + PERIOD_NS * np.arange(1, truth.ticks + 1):
+    for at_ns in truth.start_ns + words.PERIOD_NS * np.arange(1, truth.ticks + 1):
         newest = int(np.searchsorted(received_ns, at_ns, side="right")) - 1
         if newest < 0 or at_ns - received_ns[newest] > SILENT_NS:
             result.append(0.0)

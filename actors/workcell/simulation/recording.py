@@ -32,13 +32,13 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from actors.geometry.arms.kinematics import capsules_at
-from actors.workcell.cameras.sources import PERIOD_NS, CameraError
+from actors.workcell.cameras.sources import CameraError
 from actors.workcell.simulation.arm import ARM
 from actors.workcell.simulation.drawing.render import View
 from actors.workcell.simulation.human import CAPSULES
 from actors.workcell.simulation.room import cameras
 from actors.workcell.simulation.stage import Stage
-from actors.workcell.vocabulary import PERIOD_S
+from actors.workcell.vocabulary import PERIOD_NS, PERIOD_S
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence

@@ -15,12 +15,13 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from actors.geometry.arms.kinematics import capsules_at
-from actors.workcell.cameras.sources import FRAME_S, PERIOD_NS, CameraError, check_options
+from actors.workcell.cameras.sources import FRAME_S, CameraError, check_options
 from actors.workcell.scenarios import scenario_of
 from actors.workcell.simulation.arm import ARM, HOME_RAD, shown_at
 from actors.workcell.simulation.drawing.render import View, robot_colours
 from actors.workcell.simulation.recording import Tape, check_truth
 from actors.workcell.simulation.stage import Stage
+from actors.workcell.vocabulary import PERIOD_NS
 
 if TYPE_CHECKING:
     import numpy.typing as npt

@@ -10,13 +10,12 @@ from polling import until
 
 from actors.workcell.camera import Camera, Capture
 from actors.workcell.cameras.sources import (
-    PERIOD_NS,
     CameraEndedError,
     CameraError,
     source_of,
 )
 from actors.workcell.simulation.room import cameras
-from actors.workcell.vocabulary import CALIBRATION, IMAGE, camera_entity
+from actors.workcell.vocabulary import CALIBRATION, IMAGE, PERIOD_NS, camera_entity
 from enact_dist import Lock, View, testing
 
 CALIBRATION_OF = cameras(0.1)[0]  # 64 x 48

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from actors.geometry.arms.kinematics import capsules_at
-from actors.workcell.cameras.sources import FRAME_S, PERIOD_NS, CameraError, source_of
+from actors.workcell.cameras.sources import FRAME_S, CameraError, source_of
 from actors.workcell.demo.options import Options
 from actors.workcell.scenarios import scenario_of
 from actors.workcell.simulation import sources
@@ -30,6 +30,7 @@ from actors.workcell.vocabulary import (
     HUMANS,
     IMAGE,
     JOINTS,
+    PERIOD_NS,
     PLAYING,
     ROBOT,
     SCENARIO,
