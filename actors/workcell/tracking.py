@@ -24,7 +24,7 @@ from actors.workcell.vocabulary import (
     HULL,
     HUMANS,
     LIMBS,
-    PERIOD_S,
+    PERIOD_NS,
     PREDICTION,
     SET_BACK_NS,
     TRACK,
@@ -95,7 +95,7 @@ class HumanTracking(Actor):
     limbs_every: int = 3
 
     def __init__(self) -> None:
-        self._last_ns = self._next = self._sets = 0
+        self._next = 0
         self._people: dict[Entity, Person] = {}
 
     def update(self, lock: Lock) -> None:
@@ -103,18 +103,17 @@ class HumanTracking(Actor):
         if lock.is_null(self.grid):
             return
         hull, grid, now_ns = lock[self.hull], lock[self.grid], lock.stamp_ns(self.hull)
-        if now_ns < self._last_ns - SET_BACK_NS:
-            self._last_ns, self._people = 0, {}
-        seconds = (now_ns - self._last_ns) / 1e9 if self._last_ns else PERIOD_S
+        tracks = dict(lock[self.tracks].items())
+        seconds = since_last_s(tracks.values(), now_ns)
         if seconds <= 0.0:
             return
-        self._last_ns, self._sets = now_ns, self._sets + 1
-        known = known_people(dict(lock[self.tracks].items()), self._people, now_ns)
+        known = known_people(tracks, self._people, now_ns)
         self._next = max(self._next, first_free(known))
         self._people, seen = followed(
             known, hull, grid,
             seconds=seconds, now_ns=now_ns, free=self._next, hidden_s_max=self.hidden_s_max,
         )  # fmt: skip
+        finds_limbs = round(now_ns / PERIOD_NS) % self.limbs_every == 0
         for name in known.keys() - self._people.keys():
             lock[self.tracks].pop(name, None)
             lock[self.limbs].pop(name, None)
@@ -124,7 +123,7 @@ class HumanTracking(Actor):
             lock[self.predictions][name] = person.prediction(seen.get(name), now_ns)
             if name not in seen:
                 lock[self.limbs].pop(name, None)
-            elif name not in known or known[name].track.hidden or not self._sets % self.limbs_every:
+            elif name not in known or known[name].track.hidden or finds_limbs:
                 lock[self.limbs][name] = limbs(seen[name].points_m)
 
 
@@ -138,13 +137,11 @@ class Person:
 
     Attributes:
         track: What is published of them.
-        hidden_ns: Since when they are hidden, nanoseconds since 1970; 0: they are seen.
         still_m: (2,), x and y where they have been since `still_ns`, if they are low; else None.
         still_ns: Nanoseconds since 1970.
     """
 
     track: Track
-    hidden_ns: int = 0
     still_m: F64 | None = None
     still_ns: int = 0
 
@@ -155,8 +152,9 @@ class Person:
         return cls(_track(state, body, body.top_m, now_ns, now_ns)).standing(body, now_ns)
 
     def hidden_s(self, now_ns: int) -> float:
-        """Return for how long they have been hidden."""
-        return (now_ns - self.hidden_ns) / 1e9 if self.hidden_ns else 0.0
+        """Return for how long they have been hidden: since the set after they were last seen."""
+        since_ns = now_ns - self.track.seen_ns - PERIOD_NS
+        return max(0, since_ns) / 1e9 if self.track.hidden else 0.0
 
     def moved(self, seconds: float) -> State:
         """Return where they are some time later, as far as it is known."""
@@ -174,7 +172,7 @@ class Person:
         height_m = 0.8 * self.track.height_m + 0.2 * body.top_m
         first_ns = min(self.track.first_ns, now_ns)
         track = _track(corrected(*expected, body.centre_m), body, height_m, first_ns, now_ns)
-        return replace(self, track=track, hidden_ns=0).standing(body, now_ns)
+        return replace(self, track=track).standing(body, now_ns)
 
     def standing(self, body: Body, now_ns: int) -> Person:
         """Return them where a body was seen, marked as foreign if that is low and still."""
@@ -184,7 +182,7 @@ class Person:
         if place_m is None or np.hypot(*(body.centre_m - place_m)) > STILL_M:
             place_m, since_ns = body.centre_m, now_ns
         track = replace(self.track, foreign=now_ns - since_ns >= STILL_S * 1e9)
-        return Person(track, 0, place_m, since_ns)
+        return Person(track, place_m, since_ns)
 
     def lost(self, expected: State, grid: Grid, now_ns: int, hidden_s_max: float) -> Person | None:
         """Return them hidden, or None if they have left."""
@@ -197,10 +195,9 @@ class Person:
             return None
         spread = np.diag([(SEEN_M + WALK_M_S * hidden_s) ** 2] * 2 + [WALK_M_S**2] * 2)
         still, covariance = np.zeros(3), _covariance(spread)
-        track = replace(
-            before, velocity_m_s=still, covariance=covariance, hidden=True, foreign=False
+        return Person(
+            replace(before, velocity_m_s=still, covariance=covariance, hidden=True, foreign=False)
         )
-        return Person(track, self.hidden_ns or now_ns)
 
     def prediction(self, body: Body | None, now_ns: int) -> Prediction:
         """Return where they will be; a hidden one, who has no body, may be anywhere around."""
@@ -215,18 +212,29 @@ class Person:
         )
 
 
+def since_last_s(tracks: Iterable[Track], now_ns: int) -> float:
+    """Return how long before a set the one was that some tracks are of, seconds.
+
+    It is one period where no track tells, and where the clock of the cameras was set back.
+    """
+    last_ns = max((track.seen_ns for track in tracks if not track.hidden), default=0)
+    is_told = last_ns and now_ns >= last_ns - SET_BACK_NS
+    return (now_ns - last_ns if is_told else PERIOD_NS) / 1e9
+
+
 def known_people(
     tracks: Mapping[Entity, Track], before: Mapping[Entity, Person], now_ns: int
 ) -> dict[Entity, Person]:
     """Return the people of some tracks, with what was known of them before; sorted by entity.
 
-    Someone hidden of whom no more is known, as after a restart, counts as hidden from now on.
+    Where the clock of the cameras was set back, they were seen just now.
     """
     found = {}
     for name in sorted(tracks):
-        person = before.get(name) or Person(tracks[name])
-        hidden_ns = (person.hidden_ns or now_ns) if tracks[name].hidden else 0
-        found[name] = replace(person, track=tracks[name], hidden_ns=hidden_ns)
+        track, person = tracks[name], before.get(name)
+        if person is None or person.still_ns > now_ns:
+            person = Person(track)
+        found[name] = replace(person, track=replace(track, seen_ns=min(track.seen_ns, now_ns)))
     return found
 
 
