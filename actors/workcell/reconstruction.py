@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
 
@@ -42,19 +42,21 @@ from actors.workcell.vocabulary import (
 from enact_dist import Actor, Together, View, ViewEach, World, Write
 
 if TYPE_CHECKING:
-    from collections.abc import Container, Iterable, Mapping
+    from collections.abc import Callable, Container, Iterable, Mapping
 
     import numpy.typing as npt
 
     from actors.geometry.hull.refinement import Refined
     from actors.geometry.hull.visibility import CameraTable
-    from actors.workcell.vocabulary import ArmModel
+    from actors.workcell.vocabulary import ArmModel, Grid
     from enact_dist import Entity, Lock
 
     F64 = npt.NDArray[np.float64]
 
 AHEAD_NS_MAX: Final = 100_000_000
 """So long after the newest sample of the joints their speed still tells where they are."""
+SETS_OF: Final = ("cameras", "within_s", "least")
+"""Options by which the sets are made."""
 VOXELS_MAX: Final = 150_000
 """A hull of more voxels, ten times those of a person, keeps the nearest to the robot: all cameras
 in the dark fill the grid, and 100 versions of that would take 3 GB of the shard."""
@@ -63,15 +65,32 @@ HUMAN_M_S: Final = 1.6
 GAP_S: Final = 0.5
 """After so long without a hull a late one is better than none: it says why the robot stands."""
 
+NO_ARM: Final[F64 | None] = np.empty((0, 7))
+"""Capsules of a robot that is not there."""
+
 _ONLINE: Final = World("online")
 
 
-def _sets(cameras: int, within_s: float, least: int) -> Together[Silhouette]:
+def _sets(
+    cameras: int = CAMERA_COUNT, within_s: float = 0.0, least: int = 1
+) -> Together[Silhouette]:
+    """Return the sets of a cell.
+
+    Args:
+        cameras: How many it has, 2 or more.
+        within_s: How far the exposures of a set may lie apart; less than half the period.
+        least: With how many silhouettes a set is used, at least.
+
+    Raises:
+        ValueError: One of them is out of range.
+    """
+    if not within_s < PERIOD_S / 2:
+        raise ValueError(
+            f"within_s is {within_s:g}; with half the period, {PERIOD_S / 2:g} s, or more it"
+            " cannot be known which image belongs to which set"
+        )
     views = [View(_ONLINE, camera_entity(number), SILHOUETTE) for number in range(cameras)]
     return Together(views, least=least, within_s=within_s, newest_only=True)
-
-
-_SILHOUETTES: Final = _sets(CAMERA_COUNT, 0.0, 1)
 
 
 class Reconstruction(Actor):
@@ -92,7 +111,7 @@ class Reconstruction(Actor):
     """
 
     online = _ONLINE
-    silhouettes = _SILHOUETTES
+    silhouettes = _sets()
     calibrations = ViewEach(online, CAMERAS, CALIBRATION)
     boxes = ViewEach(online, OBSTACLES, BOXES)
     surfaces = ViewEach(online, OBSTACLES, SURFACE)
@@ -118,52 +137,24 @@ class Reconstruction(Actor):
         cameras: int | None = None,
         within_s: float | None = None,
     ) -> None:
-        every = self.silhouettes
-        if cameras not in (None, len(every.requests)) or within_s not in (None, every.within_s):
+        self.robot, self.stuck, sets = robot, stuck, self.silhouettes
+        if cameras not in (None, len(sets.requests)) or within_s not in (None, sets.within_s):
             raise ValueError(
                 f"asked for {cameras} cameras within {within_s} s; this class is for"
-                f" {len(every.requests)} within {every.within_s:g} s; Reconstruction.of(cameras,"
-                " within_s) returns another"
+                f" {len(sets.requests)} within {sets.within_s:g} s; Reconstruction.of_options"
+                " returns another"
             )
-        self.robot, self.stuck, self.within_s = robot, stuck, every.within_s
-        self._made_of: object = None
-        self._made: tuple[Refinement, VoxelBlocks] | None = None
-        self._last_ns = self._written_ns = 0
         self._images = NewImages()
+        self._carving: tuple[object, Carving] | None = None
+        self._written = 0, 0
+        """Version of the last hull if it stands, and when it was written, ns since 1970."""
 
     @classmethod
-    def of(
-        cls, cameras: int = CAMERA_COUNT, within_s: float = 0.0, *, least: int = 1
-    ) -> type[Self]:
-        """Return the reconstruction of a cell.
-
-        Args:
-            cameras: How many it has, 2 or more.
-            within_s: See the class; less than half the period.
-            least: With how many silhouettes a set is used, at least.
-
-        Raises:
-            ValueError: One of them is out of range.
-        """
-        if not within_s < PERIOD_S / 2:
-            raise ValueError(
-                f"within_s is {within_s:g}; with half the period, {PERIOD_S / 2:g} s, or more it"
-                " cannot be known which image belongs to which set"
-            )
-        every = _sets(cameras, within_s, least)
-        if every == cls.silhouettes:
-            return cls
+    def of_options(cls, options: Mapping[str, Any]) -> type[Self]:
+        """Return the reconstruction of a cell by `cameras`, `within_s` and `least`, see `_sets`."""
+        every = _sets(**{name: options[name] for name in SETS_OF if options.get(name) is not None})
         names = {"silhouettes": every, "triggers": (every,), "__module__": cls.__module__}
-        return type(cls.__name__, (cls,), names)
-
-    @classmethod
-    def of_options(cls, options: Mapping[str, object]) -> type[Self]:
-        """Return the reconstruction of a cell by the options `cameras` and `within_s`."""
-        cameras, within_s = options.get("cameras"), options.get("within_s")
-        return cls.of(
-            cameras if isinstance(cameras, int) else len(cls.silhouettes.requests),
-            within_s if isinstance(within_s, float) else cls.silhouettes.within_s,
-        )
+        return cls if every == cls.silhouettes else type(cls.__name__, (cls,), names)
 
     def start(self) -> None:
         """Let OpenCV work in the actor's own thread."""
@@ -176,28 +167,18 @@ class Reconstruction(Actor):
     def update(self, lock: Lock) -> None:
         """Write the occupied voxels with the stamp of the set; skip a set that is too late."""
         stamp_ns, now_ns = lock.stamp_ns(self.silhouettes), self.now_ns()
-        fresh = now_ns - self._written_ns < GAP_S * 1e9
-        if fresh and now_ns - stamp_ns > self.late_s * 1e9:
+        version, written_ns = self._written
+        hulls_come = version == lock.version(self.hull) and now_ns - written_ns < GAP_S * 1e9
+        if hulls_come and now_ns - stamp_ns > self.late_s * 1e9:
             return
-        refinement, blocks = self._prepared(lock)
-        found = dict(zip(self._names, lock[self.silhouettes], strict=True))
-        given = self._images.of(found, or_repeated=not self.stuck)
-        seen = [given.get(name) for name in self._names]
-        arm: F64 | None = np.empty((0, 7))
+        carving, arm = self._carving_of(lock), NO_ARM
         if self.robot:
             arm = arm_at(lock.get(self.model), lock.get(self.joints), stamp_ns)
-        occupied = refinement.step(
-            [one.packed if one else None for one in seen],
-            arm,
-            (stamp_ns - self._last_ns) / 1e9 if self._last_ns else math.inf,
-            [one.shade if one else None for one in seen],
-        )
-        self._last_ns, self._written_ns = stamp_ns, now_ns
-        if self.robot and len(occupied.rows) > VOXELS_MAX:
-            occupied = occupied.limited(VOXELS_MAX)
-        lock[self.hull] = hull_of(occupied, blocks, tuple(given), self._moved_m)
+        hull, raw = carving.of_set(lock[self.silhouettes], stamp_ns, arm, stuck=self.stuck)
+        self._written = lock.version(self.hull) + 1, now_ns
+        lock[self.hull] = hull
         if lock.get(self.wanted, 0) > 0:
-            lock[self.raw_hull] = blocks.indices(occupied.raw)
+            lock[self.raw_hull] = carving.blocks.indices(raw)
 
     def tables(
         self, blocks: VoxelBlocks, calibrations: list[Calibration], boxes: list[F64]
@@ -205,43 +186,95 @@ class Reconstruction(Actor):
         """Return what each camera can say about the voxels of a grid."""
         return [camera_table(blocks, calibration, boxes) for calibration in calibrations]
 
-    def _prepared(self, lock: Lock) -> tuple[Refinement, VoxelBlocks]:
-        """Return refinement and grid; rebuild the tables if the cell has changed.
+    def _carving_of(self, lock: Lock) -> Carving:
+        """Return the carving of the cell; it begins anew if the cell has changed."""
+        names = [str(view.entity) for view in self.silhouettes.requests]
+        known = {entity.name: one for entity, one in lock[self.calibrations].items()}
+        boxes = dict(sorted(lock[self.boxes].items()))
+        has_grid = not lock.is_null(self.grid)
+        check_known(names, known, boxes, lock[self.surfaces], has_grid=has_grid)
+        cameras, shapes = {name: known[name] for name in names}, list(boxes.values())
+        made_of = lock.version(self.grid), _bytes_of(list(cameras.values()), shapes)
+        if self._carving is None or self._carving[0] != made_of:
+            moved_m = HUMAN_M_S * self.silhouettes.within_s
+            grid, images = lock[self.grid], self._images
+            carving = Carving(grid, cameras, shapes, self.tables, images, moved_m=moved_m)
+            self._carving = made_of, carving
+        return self._carving[1]
 
-        Raises:
-            ValueError: Grid or calibration of a camera are missing or wrong, or an obstacle has a
-                surface and no boxes; in one line.
-        """
-        of_camera = {entity.name: one for entity, one in lock[self.calibrations].items()}
-        of_obstacle = dict(lock[self.boxes].items())
-        check_known(
-            self._names, of_camera, of_obstacle, lock[self.surfaces],
-            has_grid=not lock.is_null(self.grid),
-        )  # fmt: skip
-        calibrations = [of_camera[name] for name in self._names]
-        boxes = [of_obstacle[entity] for entity in sorted(of_obstacle, key=str)]
-        made_of = (lock.version(self.grid), _bytes_of(calibrations, boxes))
-        if self._made is not None and made_of == self._made_of:
-            return self._made
-        for name, calibration in zip(self._names, calibrations, strict=True):
+
+class Carving:
+    """Carves what is occupied out of the grid of a cell, one set of silhouettes after the other.
+
+    Args:
+        grid: The voxels.
+        cameras: Calibrations by name, in the order of the silhouettes.
+        boxes: Static obstacles, (n, 15) each.
+        tables: Returns what each camera can say about the voxels, see `camera_table`.
+        images: Which images came before.
+        moved_m: How far a person walks between two exposures of one set.
+
+    Attributes:
+        blocks: The voxels.
+
+    Raises:
+        ValueError: Grid or calibration of a camera are wrong; in one line.
+    """
+
+    def __init__(
+        self,
+        grid: Grid,
+        cameras: Mapping[str, Calibration],
+        boxes: list[F64],
+        tables: Callable[[VoxelBlocks, list[Calibration], list[F64]], list[CameraTable]],
+        images: NewImages,
+        *,
+        moved_m: float,
+    ) -> None:
+        for name, calibration in cameras.items():
             check_calibration(name, calibration)
-        grid = lock[self.grid]
-        blocks = VoxelBlocks(grid.origin_m, grid.voxel_m, grid.shape)
-        tables = self.tables(blocks, calibrations, boxes)
-        hull = VisualHull(blocks, tables)
-        self._made = Refinement(hull, calibrations, boxes, moved_m=self._moved_m), blocks
-        self._made_of, self._last_ns = made_of, 0
-        return self._made
+        calibrations = list(cameras.values())
+        self.blocks = VoxelBlocks(grid.origin_m, grid.voxel_m, grid.shape)
+        hull = VisualHull(self.blocks, tables(self.blocks, calibrations, boxes))
+        self._refinement = Refinement(hull, calibrations, boxes, moved_m=moved_m)
+        self._names, self._images, self._moved_m = list(cameras), images, moved_m
+        self._last: tuple[int, Hull, npt.NDArray[np.int64]] | None = None
 
-    @property
-    def _moved_m(self) -> float:
-        """How far a person walks between two exposures of one set."""
-        return HUMAN_M_S * self.within_s
+    def of_set(
+        self,
+        silhouettes: Iterable[Silhouette | None],
+        stamp_ns: int,
+        arm: F64 | None,
+        *,
+        stuck: bool = True,
+    ) -> tuple[Hull, npt.NDArray[np.int64]]:
+        """Return the hull of a set, and the rows of its voxels before refinement.
 
-    @property
-    def _names(self) -> list[str]:
-        """The names of the cameras, in the order of their silhouettes."""
-        return [str(view.entity) for view in self.silhouettes.requests]
+        The set of the last call has the same hull again: its images came before, and no time has
+        passed.
+
+        Args:
+            silhouettes: Of each camera, in their order; None: it gave none.
+            stamp_ns: Exposure of the set.
+            arm: Capsules of the robot then, (n, 7), see `arm_at`.
+            stuck: An image that came before counts as none.
+        """
+        last = self._last
+        if last is None or last[0] != stamp_ns:
+            found = dict(zip(self._names, silhouettes, strict=True))
+            given = self._images.of(found, or_repeated=not stuck)
+            seen = [given.get(name) for name in self._names]
+            occupied = self._refinement.step(
+                [one.packed if one else None for one in seen],
+                arm,
+                math.inf if last is None else (stamp_ns - last[0]) / 1e9,
+                [one.shade if one else None for one in seen],
+            )
+            if (arm is None or len(arm)) and len(occupied.rows) > VOXELS_MAX:
+                occupied = occupied.limited(VOXELS_MAX)
+            hull = hull_of(occupied, self.blocks, tuple(given), self._moved_m)
+            self._last = last = stamp_ns, hull, occupied.raw
+        return last[1:]
 
 
 class NewImages:

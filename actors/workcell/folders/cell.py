@@ -76,8 +76,8 @@ def hull_by_actors(shots: Sequence[Shot], grid: VoxelBlocks) -> npt.NDArray[np.i
         for number, shot in enumerate(shots):
             online.init(camera_entity(number), CALIBRATION, _calibration(shot.camera, scale))
         count = len(shots)
-        found_by = Reconstruction.of(count, least=count)(robot=False, stuck=False)
-        actors = [BackgroundSubtraction(), found_by]
+        reconstruction = Reconstruction.of_options({"cameras": count, "least": count})
+        actors = [BackgroundSubtraction(), reconstruction(robot=False, stuck=False)]
         with (
             online.watch(str(WORKSPACE), HULL) as watch,
             running(actors, cell) as failures,

@@ -8,6 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from lost_commits import lose_commit
 from slots import put_online as put
 
 from actors.geometry.arms.kinematics import capsules_at
@@ -205,6 +206,38 @@ def test_a_late_set_is_passed_over_while_hulls_come(cell, monkeypatch):
     assert written == [0, 0, 2]
 
 
+def members_of(stamp_ns):
+    """Return the stamps of a set of all cameras."""
+    return (stamp_ns,) * len(CAMERAS)
+
+
+def test_a_set_whose_hull_was_not_written_gives_the_same_hull_again(cell):
+    """Its images are not taken for those of the set before, which would veto nothing."""
+    actor = Reconstruction()
+    give_all(cell, FIRST_NS, image_checksum=7)
+    testing.run_once(actor, cell)
+    second_ns = FIRST_NS + PERIOD_NS
+    give_all(cell, second_ns, image_checksum=8)
+    lose_commit(actor, cell, members=members_of(second_ns))
+    assert seen(cell)[1] == FIRST_NS
+    testing.run_once(actor, cell)
+    hull, stamp_ns = seen(cell)
+    assert (stamp_ns, len(hull.cameras)) == (second_ns, 8)
+
+
+def test_a_late_set_is_taken_if_the_hull_before_it_was_not_written(cell, monkeypatch):
+    """Hulls come as long as their commits stand."""
+    late_ns = FIRST_NS + 10_000_000_000
+    monkeypatch.setattr("actors.workcell.reconstruction.time.time_ns", lambda: late_ns)
+    actor = Reconstruction()
+    actor.late_s = 0.3
+    give_all(cell, FIRST_NS)
+    lose_commit(actor, cell, members=members_of(FIRST_NS))
+    give_all(cell, FIRST_NS + PERIOD_NS)
+    testing.run_once(actor, cell)
+    assert seen(cell)[1] == FIRST_NS + PERIOD_NS
+
+
 def test_a_hull_of_too_many_voxels_keeps_the_nearest(cell, monkeypatch):
     """Cameras in the dark fill the grid; the distance is that of all, the rest is counted."""
     monkeypatch.setattr("actors.workcell.reconstruction.VOXELS_MAX", 500)
@@ -341,7 +374,7 @@ def test_cameras_without_a_common_trigger_make_one_set(fine_cell):
 def test_an_empty_cell_of_cameras_without_a_trigger_is_infinitely_far(fine_cell):
     """The robot's own outlines do not grow."""
     give_all(fine_cell, FIRST_NS, masks(body=False, views=FINE))
-    testing.run_once(Reconstruction.of(within_s=0.035)(), fine_cell)
+    testing.run_once(Reconstruction.of_options({"within_s": 0.035})(), fine_cell)
     assert seen(fine_cell)[0].nearest_m == math.inf
 
 
