@@ -235,6 +235,22 @@ class Search:
                 break
         return found
 
+    def path(self, found: Plan, scene: Scene, planned_ns: int, took_ms: float) -> Path:
+        """Return what was found at a time, ns since 1970, as a path."""
+        last = scene.last
+        came_from = last.from_goal if last is not None else -1
+        return Path(
+            waypoints=found.waypoints,
+            number=scene.number,
+            from_goal=came_from if self.from_goal is None else self.from_goal,
+            to_goal=self.goal,
+            planned_ns=planned_ns,
+            length_rad=float(np.linalg.norm(np.diff(found.waypoints, axis=0), axis=1).sum()),
+            reason=found.reason or self.why,
+            took_ms=took_ms,
+            captured_ns=scene.captured_ns,
+        )
+
     def is_news(self, found: Plan, last: Path | None) -> bool:
         """Return whether what was found replaces the last path.
 
@@ -278,6 +294,11 @@ class Scene:
     captured_ns: int
     ahead_s: float
     branch_s: float
+
+    @property
+    def number(self) -> int:
+        """Number of the next path."""
+        return 1 if self.last is None else self.last.number + 1
 
     def due(self, before: Waits, now_ns: Callable[[], int]) -> tuple[Search | None, Waits]:
         """Return which path is to be found, None if no other one, and what is waited for.
@@ -383,12 +404,13 @@ class PathPlanning(Actor):
     ahead_s: float = 1.0
     branch_s: float = 0.13
 
-    def __init__(self, *, predict: bool = True, seed: int = 1) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.predict, self.seed = predict, seed
         self._obstacles: tuple[bytes, Obstacles] | None = None
-        self._followed: Followed | None = None
-        self._waits = Waits()
+        self._followed: tuple[Followed, ...] = ()
+        self._waits = self._before = Waits()
+        self._done = 0, 0
+        """Set of the last step, and version of the path if that step stands."""
 
     def start(self) -> None:
         """Load the planner before any lock is held."""
@@ -402,33 +424,29 @@ class PathPlanning(Actor):
         """Look at the path; plan another one where that is due."""
         if any(map(lock.is_null, (self.model, self.task, self.joints, self.grid))):
             return
-        scene = self._scene(lock)
-        search, self._waits = scene.due(self._waits, self.now_ns)
-        if search is None:
-            return
-        last, began_s = scene.last, time.monotonic()
-        number = last.number + 1 if last is not None else 1
-        found = search.found(scene, seed=self.seed + number, limit_s=self.limit_s)
+        scene, version = self._scene(lock), lock.version(self.path)
+        captured_ns, planned = self._done
+        if scene.captured_ns != captured_ns and version == planned:
+            self._before = self._waits
+        search, self._waits = scene.due(self._before, self.now_ns)
+        path = self._sought(search, scene) if search is not None else None
+        if path is not None:
+            lock[self.path] = path
+        self._done = scene.captured_ns, version + (path is not None)
+
+    def _sought(self, search: Search, scene: Scene) -> Path | None:
+        """Return the path that a search gives; None if the last one stays."""
+        began_s = time.monotonic()
+        found = search.found(scene, seed=self.seed + scene.number, limit_s=self.limit_s)
         self._waits = self._waits.after(found)
-        if not search.is_news(found, last):
-            return
-        came_from = last.from_goal if last is not None else -1
-        path = Path(
-            waypoints=found.waypoints,
-            number=number,
-            from_goal=came_from if search.from_goal is None else search.from_goal,
-            to_goal=search.goal,
-            planned_ns=self.now_ns(),
-            length_rad=float(np.linalg.norm(np.diff(found.waypoints, axis=0), axis=1).sum()),
-            reason=found.reason or search.why,
-            took_ms=1e3 * (time.monotonic() - began_s),
-            captured_ns=scene.captured_ns,
-        )
-        lock[self.path] = path
-        branch = search.branch
+        if not search.is_news(found, scene.last):
+            return None
+        took_ms = 1e3 * (time.monotonic() - began_s)
+        path, branch = search.path(found, scene, self.now_ns(), took_ms), search.branch
         if branch is not None and len(path.waypoints):
             onto = branch.onto(path, scene.model)
-            self._followed = Followed(path.identity, onto, branch.speeds)
+            self._followed += (Followed(path.identity, onto, branch.speeds),)
+        return path
 
     def _scene(self, lock: Lock) -> Scene:
         """Return what is known; what is the same as before is worked out once."""
@@ -437,15 +455,17 @@ class PathPlanning(Actor):
         rows = np.concatenate([np.empty((0, 15)), *boxes])
         size = np.array([grid.voxel_m, *grid.shape])
         parts = (rows, model.dh, model.base, model.capsules, grid.origin_m, size)
-        key = b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
-        if self._obstacles is None or self._obstacles[0] != key:
-            self._obstacles = key, Obstacles(model, grid, rows)
-        obstacles = self._obstacles[1]
-        last, done = lock.get(self.path), lock.get(self.execution)
-        path = last if last is not None and len(last.waypoints) else None
-        if path and (self._followed is None or self._followed.path != path.identity):
-            self._followed = Followed.from_rest(path, model)
-        is_refused = done and path and done.refused_path == path.identity
+        made_of = b"".join(part.tobytes() for part in parts)
+        if self._obstacles is None or self._obstacles[0] != made_of:
+            self._obstacles = made_of, Obstacles(model, grid, rows)
+        obstacles, last, done = self._obstacles[1], lock.get(self.path), lock.get(self.execution)
+        followed, refusal = None, ""
+        if last is not None and len(last.waypoints):
+            known = (one for one in self._followed if one.path == last.identity)
+            followed = next(known, None) or Followed.from_rest(last, model)
+            self._followed = (followed,)
+            if done is not None and done.refused_path == last.identity:
+                refusal = done.path_refusal
         predictions = list(lock[self.predictions].values()) if self.predict else []
         now = obstacles.around(hull, [], 0.0)
         return Scene(
@@ -453,8 +473,8 @@ class PathPlanning(Actor):
             joints=lock[self.joints],
             task=lock[self.task],
             last=last,
-            refusal=done.path_refusal if done and is_refused else "",
-            followed=self._followed if path else None,
+            refusal=refusal,
+            followed=followed,
             obstacles=obstacles,
             now=now,
             soon=obstacles.around(hull, predictions, SOON_S) if predictions else now,

@@ -1,9 +1,11 @@
 """PathPlanning leads from goal to goal, around whoever is there, or waits and says why."""
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from lost_commits import lose_commit
 from slots import get, put
 
 from actors.geometry.arms.clearance import CellGrid
@@ -23,6 +25,7 @@ from actors.workcell.vocabulary import (
     HULL,
     JOINTS,
     MODEL,
+    NO_PATH,
     PATH,
     PREDICTION,
     ROBOT,
@@ -91,6 +94,11 @@ class Cell:
 
     def see(self, q, voxels=NOBODY, dq=None):
         """Let one set come while the arm is at `q`; return the path."""
+        self.come(q, voxels, dq)
+        testing.run_once(self.actor, self.cell)
+        return get(self.online, ROBOT, PATH)
+
+    def come(self, q, voxels=NOBODY, dq=None):
         self.now_ns += PERIOD_NS
         dq = np.zeros(7) if dq is None else dq
         stamps = self.now_ns - 10_000_000 * np.arange(29, -1, -1)
@@ -101,8 +109,6 @@ class Cell:
             np.zeros(count, np.int16), {}, (), np.inf, -1,
         )  # fmt: skip
         put(self.online, WORKSPACE, HULL, hull, self.now_ns)
-        testing.run_once(self.actor, self.cell)
-        return get(self.online, ROBOT, PATH)
 
 
 @pytest.fixture
@@ -201,6 +207,46 @@ def test_blocked_path_is_replaced_after_two_sets(worlds):
     np.testing.assert_allclose(start, on_way + along * dq / 0.1, atol=1e-9)
     assert 0.0 < along < 0.4
     assert not touches(new, person())
+
+
+def test_a_set_counts_once_though_its_commit_fails(worlds):
+    """Someone in the way of one set could be noise, though its step is done again."""
+    cell = Cell(worlds)
+    cell.see(START)
+    old = cell.see(LEFT)
+    on_way = LEFT + 0.02 * (RIGHT - LEFT)
+    cell.come(on_way, person(), 0.1 * heading_to(LEFT, RIGHT))
+    lose_commit(cell.actor, worlds)
+    testing.run_once(cell.actor, worlds)
+    assert get(cell.online, ROBOT, PATH).number == old.number
+
+
+def test_a_goal_is_left_though_the_commit_of_the_path_fails(worlds):
+    """The arm has dwelt there: it does not begin to dwell anew."""
+    cell = Cell(worlds, dwell_s=0.35)
+    cell.see(START)
+    for _ in range(4):
+        before = cell.see(LEFT)
+    cell.come(LEFT)
+    lose_commit(cell.actor, worlds)
+    assert cell.see(LEFT).number == before.number + 1
+
+
+def test_an_arm_is_on_its_way_to_its_path_though_the_one_after_it_was_not_written(worlds):
+    """It rests before the place where it goes over: that is known still, and no other path comes."""
+    cell = Cell(worlds)
+    cell.actor.now_ns = lambda: cell.now_ns
+    cell.see(START)
+    cell.see(LEFT)
+    ahead = heading_to(LEFT, RIGHT)
+    cell.see(LEFT + 0.3 * ahead, REACHING, ahead)
+    over = cell.see(LEFT + 0.4 * ahead, REACHING, ahead)
+    refused = Execution("moving", 1.0, 1.0, 0, 0, 2, 0, 0, "", over.identity, "it is refused")
+    put(cell.online, ROBOT, EXECUTION, refused)
+    cell.come(LEFT + 0.42 * ahead, REACHING, 0.4 * ahead)
+    lose_commit(cell.actor, worlds)
+    put(cell.online, ROBOT, EXECUTION, replace(refused, refused_path=NO_PATH, path_refusal=""))
+    assert cell.see(LEFT + 0.45 * ahead).number == over.number
 
 
 def heading_to(one, other):
@@ -376,7 +422,8 @@ def test_prediction_is_avoided_but_never_stops(worlds):
 
     assert len(straight.waypoints) == 2
     assert len(kept.waypoints) >= 2
-    ignoring = PathPlanning(predict=False)
+    ignoring = PathPlanning()
+    ignoring.predict = False
     ignoring.limit_s = 60.0
     cell.actor = ignoring
     assert cell.see(LEFT + (RIGHT - LEFT) * 0.25).number == kept.number
