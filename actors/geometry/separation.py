@@ -117,8 +117,10 @@ class Reaction:
         robot_s: From the arrival of a command until the arm decelerates in full: the cycle of its
             loop and what its limit of jerk takes.
         margin_s: How much longer the way from here to the robot may take than it ever took.
-        latest_s: Greatest time from an exposure until the robot's loop refuses to go on.
         kept: How many images count.
+
+    Attributes:
+        latest_s: Greatest time from an exposure until the robot's loop refuses to go on.
     """
 
     def __init__(
@@ -127,24 +129,32 @@ class Reaction:
         period_s: float,
         robot_s: float,
         margin_s: float = 0.03,
-        latest_s: float = LATEST_S,
         kept: int = 600,
     ) -> None:
-        self._period_s, self._margin_s, self._latest_s = period_s, margin_s, latest_s
-        self._robot_s = robot_s
+        self._period_s, self._margin_s, self._robot_s = period_s, margin_s, robot_s
         self._ages_s: deque[float] = deque(maxlen=kept)
+        self._newest_ns: int | None = None
+        self.latest_s = LATEST_S
 
-    def seen(self, age_s: float) -> None:
-        """Take note of the age that an image had when a speed was made of it."""
+    def seen(self, captured_ns: int, age_s: float) -> None:
+        """Take note of the age that an image had when a speed was made of it, at last.
+
+        Args:
+            captured_ns: Its exposure, which tells it from others.
+            age_s: Its age, seconds.
+        """
+        if captured_ns == self._newest_ns:
+            self._ages_s.pop()
+        self._newest_ns = captured_ns
         self._ages_s.append(age_s)
 
     @property
     def valid_s(self) -> float:
         """How long after its exposure the robot may move on a command, seconds."""
         if len(self._ages_s) < ENOUGH:
-            return self._latest_s
+            return self.latest_s
         needed_s = max(self._ages_s) + self._period_s + self._margin_s
-        return min(self._latest_s, max(0.0, needed_s))
+        return min(self.latest_s, max(0.0, needed_s))
 
     @property
     def reaction_s(self) -> float:

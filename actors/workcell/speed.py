@@ -161,7 +161,7 @@ class SpeedControl(Actor):
     protective distance from the volume's sides, too."""
 
     def __init__(self) -> None:
-        self._reaction: Reaction | None = None
+        self._reaction = Reaction(period_s=PERIOD_S, robot_s=ROBOT_S)
         self._speeds: tuple[object, PathSpeeds] | None = None
 
     def now_ns(self) -> int:
@@ -182,7 +182,9 @@ class SpeedControl(Actor):
         hull, captured_ns = lock[self.hull], lock.stamp_ns(self.hull)
         joints, path, model = lock.get(self.joints), lock.get(self.path), lock.get(self.model)
         age_s = (self.now_ns() - captured_ns) / 1e9
-        reaction = self._measured(age_s)
+        reaction = self._reaction
+        reaction.latest_s = self.latest_s
+        reaction.seen(captured_ns, age_s)
         joints_ns = int(joints.stamp_ns[-1]) if joints is not None else 0
         states_ns = -math.inf if lock.is_null(self.cameras) else lock.stamp_ns(self.cameras)
         misfits, without = troubles_of(lock.get(self.cameras, {}))
@@ -226,13 +228,6 @@ class SpeedControl(Actor):
     def people_m_s(self, lock: Lock) -> tuple[float, str]:
         """Return how fast people count, and why; nothing where it is assumed."""
         return self.human_m_s, ""
-
-    def _measured(self, age_s: float) -> Reaction:
-        """Return the reaction time that was measured, this set included."""
-        if self._reaction is None:
-            self._reaction = Reaction(period_s=PERIOD_S, robot_s=ROBOT_S, latest_s=self.latest_s)
-        self._reaction.seen(age_s)
-        return self._reaction
 
     def _nominal_m_s(
         self, model: ArmModel | None, path: Path | None, joints: Joints | None

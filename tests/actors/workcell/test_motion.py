@@ -314,7 +314,7 @@ def test_robot_never_moves_faster_than_the_true_distance_allows(seed):
             pending.append((arrives, loop.now_ns, near_m - draw.uniform(0.0, 0.05)))
         for _, captured_ns, near_m in [one for one in pending if one[0] <= cycle]:
             age_s = (loop.now_ns - captured_ns) / 1e9
-            reaction.seen(age_s)
+            reaction.seen(captured_ns, age_s)
             limit = Separation(reaction.reaction_s).speed_max_m_s(near_m)
             command = speed_at(captured_ns, limit_m_s=limit, scale=float(limit > 0.0),
                                valid_ms=1e3 * reaction.valid_s)  # fmt: skip

@@ -118,15 +118,15 @@ def test_reaction_is_measured():
     reaction = Reaction(period_s=0.1, robot_s=0.03, margin_s=0.02, kept=20)
     assert reaction.reaction_s == pytest.approx(LATEST_S + 0.03)
 
-    for _ in range(19):
-        reaction.seen(0.050)
+    for image in (*range(19), 18):  # the step of the last one was done twice
+        reaction.seen(image, 0.050)
     assert reaction.valid_s == LATEST_S
-    reaction.seen(0.070)
+    reaction.seen(19, 0.070)
 
     assert reaction.valid_s == pytest.approx(0.070 + 0.1 + 0.02)
     assert reaction.reaction_s == pytest.approx(reaction.valid_s + 0.03)
-    for _ in range(20):
-        reaction.seen(0.040)
+    for image in range(20, 40):
+        reaction.seen(image, 0.040)
     assert reaction.valid_s == pytest.approx(0.040 + 0.1 + 0.02)
 
 
@@ -134,7 +134,7 @@ def test_reaction_is_never_longer_than_a_command_is_valid():
     """Late images do not stretch T_r: the robot refuses what is older."""
     reaction = Reaction(period_s=0.1, robot_s=0.03)
 
-    for _ in range(30):
-        reaction.seen(0.4)
+    for image in range(30):
+        reaction.seen(image, 0.4)
 
     assert reaction.valid_s == LATEST_S

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from lost_commits import lose_commit
 from slots import datum_of, put
 
 from actors.geometry.arms.kinematics import capsules_at
@@ -200,8 +201,8 @@ def test_reaction_time_is_measured(cell):
     cell.joints(time.time_ns())
     cell.path(HOME_RAD, AWAY)
     first = cell.judge(1.0, age_ms=20)
-    for _ in range(20):
-        quick = cell.judge(1.0, age_ms=20)
+    for age_ms in range(20):
+        quick = cell.judge(1.0, age_ms=age_ms)
 
     late = cell.judge(1.0, age_ms=400)
 
@@ -210,6 +211,17 @@ def test_reaction_time_is_measured(cell):
     assert late.valid_ms == 250.0
     assert late.limit_m_s == 0.0
     assert datum_of(cell.online, SYSTEM, SAFETY).reason == "the images come late"
+
+
+def test_an_image_counts_once_though_its_commit_fails(cell):
+    """It has the age of the speed that was written at last; twenty make the time a measured one."""
+    for age_ms in range(20, 38):
+        cell.judge(1.0, age_ms=age_ms)
+    put(cell.online, WORKSPACE, HULL, hull(1.0), time.time_ns() - 38 * MS)
+    lose_commit(cell.actor, cell.cell)
+    testing.run_once(cell.actor, cell.cell)
+    assert datum_of(cell.online, ROBOT, SPEED).valid_ms == 250.0
+    assert cell.judge(1.0, age_ms=39).valid_ms < 250.0
 
 
 def test_silent_robot_and_missing_path_are_said(cell):
