@@ -158,20 +158,20 @@ class Robot(Actor):
 
     def __init__(self, driver: str = SIMULATED_ARM) -> None:
         self.driver = driver
-        self._taken_ns = 0
+        self._taken_ns, self._refusal = 0, ""
 
     def update(self, lock: Lock) -> None:
         """Hand on what is new, and say what came of it."""
         arm = self._arm()
-        motion, refusal = arm.motion, ""
-        speed = lock.get(self.speed)
-        received_ns = time.time_ns()
+        motion, received_ns = arm.motion, time.time_ns()
+        speed, said = lock.get(self.speed), lock.get(self.execution)
         if speed is not None and speed.captured_ns != self._taken_ns:
-            refusal = motion.obey(speed, received_ns)
-            self._taken_ns = speed.captured_ns
+            self._taken_ns, self._refusal = speed.captured_ns, motion.obey(speed, received_ns)
+        elif said is not None and said.captured_ns == self._taken_ns:
+            self._refusal = ""
         if not lock.is_null(self.path):
             motion.follow(lock[self.path], received_ns)
-        lock[self.execution] = motion.execution(self._taken_ns, received_ns, refusal)
+        lock[self.execution] = motion.execution(self._taken_ns, received_ns, self._refusal)
 
     def _arm(self) -> RunningArm:
         arm = _arms.get(self.driver) if _is_open(self.driver).wait(OPENING_S) else None

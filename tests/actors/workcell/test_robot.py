@@ -7,6 +7,7 @@ import time
 
 import numpy as np
 import pytest
+from lost_commits import lose_commit
 
 from actors.workcell import robot
 from actors.workcell.motion import CommandedArm
@@ -139,6 +140,20 @@ def test_command_with_old_stamps_is_refused(running):
     assert said.reason.endswith("ms old, 250 are allowed")
     assert not running.arm.moves
     np.testing.assert_array_equal(running.arm.sent[-1][0], HOME_RAD)
+
+
+def test_refusal_is_said_though_the_first_commit_fails(running):
+    """The arm has refused the command once; a path that comes later is no refusal."""
+    assert robot._is_open(running.joints.driver).wait(60.0)
+    running.command(age_ms=300, valid_ms=250.0)
+    lose_commit(running.robot, running.cell)
+
+    said = running.obeyed()
+    running.path(HOME_RAD, AWAY)
+    later = running.obeyed()
+
+    assert (said.state, said.refused, later.refused) == ("refused", 1, 1)
+    assert later.state != "refused"
 
 
 def test_joints_are_published_at_their_rate(running):
