@@ -58,7 +58,8 @@ CHECKED_ROWS: Final = 8
 class Learning:
     """Learns the empty cell of images with a stamp after the operator's word.
 
-    A new word begins anew.
+    A new word begins anew.  A background that was not written, since its commit failed, comes again
+    with the next image.
 
     Args:
         images: How many images make a background.
@@ -85,6 +86,8 @@ class Learning:
             captured_ns: Stamp of the image.
         """
         wanted = 0 < empty_ns < captured_ns and learned_ns <= empty_ns
+        if not wanted and self._statistics.frames:
+            self._statistics = BackgroundStatistics()
         return wanted and captured_ns > self._newest_ns + self._apart_ns
 
     def learned(
@@ -95,7 +98,7 @@ class Learning:
         hidden: npt.NDArray[np.uint8] | None = None,
         before: Background | None = None,
     ) -> Background | None:
-        """Take an image that is wanted; return the background with the last one.
+        """Take an image that is wanted; return the background if it is learned.
 
         Args:
             image: (H, W, 3) uint8.
@@ -111,7 +114,6 @@ class Learning:
         learned = self._statistics
         if learned.frames < self._images:
             return None
-        self._statistics = BackgroundStatistics()
         found = Background(learned.mean, learned.spread, learned.frames, captured_ns)
         return _completed(found, learned.unknown, before)
 
@@ -217,35 +219,35 @@ class BackgroundLearning(Actor):
     def update(self, lock: Lock) -> None:
         """Take one image, if a background is to be learned; write it with the last one."""
         empty_ns, captured_ns = lock.get(self.empty, 0), lock.stamp_ns(self.image)
-        if lock.is_null(self.image):
-            return
-        if not self._learning.wants(empty_ns, lock.stamp_ns(self.background), captured_ns):
+        learned_ns, camera = lock.stamp_ns(self.background), lock.entity.name
+        if lock.is_null(self.image) or not self._learning.wants(empty_ns, learned_ns, captured_ns):
             return
         image, hidden = lock[self.image], None
         if self.arm_in_view:
             known = lock.get(self.calibration), lock.get(self.model), lock.get(self.joints)
             hidden = arm_at_rest(*known, captured_ns, image.shape[:2])
-        if self.arm_in_view and hidden is None:
-            if self._waited_for_ns != empty_ns:
+            if hidden is None:
+                if self._waited_for_ns != empty_ns:
+                    log.warning("%s is learned once the arm rests and its joints are known", camera)
                 self._waited_for_ns = empty_ns
-                log.warning(
-                    "%s is learned once the arm rests and its joints are known",
-                    lock.entity.name,
-                )
-            return
+                return
         before = lock.get(self.background)
         found = self._learning.learned(image, empty_ns, captured_ns, hidden, before)
-        if found is None:
-            return
-        lock.put(self.background, found, stamp_ns=captured_ns)
-        if found.hidden_px:
-            log.warning(
-                "%s: %d pixels (%.1f %%) were never free of the arm and count as occupied; move"
-                " the arm away from there, and declare the cell empty again",
-                lock.entity.name,
-                found.hidden_px,
-                100.0 * found.hidden_px / found.mean[..., 0].size,
-            )
+        if found is not None:
+            lock.put(self.background, found, stamp_ns=captured_ns)
+            warn_of_hidden(camera, found)
+
+
+def warn_of_hidden(camera: str, found: Background) -> None:
+    """Log what the arm has hidden in all images of a background."""
+    if found.hidden_px:
+        log.warning(
+            "%s: %d pixels (%.1f %%) were never free of the arm and count as occupied; move"
+            " the arm away from there, and declare the cell empty again",
+            camera,
+            found.hidden_px,
+            100.0 * found.hidden_px / found.mean[..., 0].size,
+        )
 
 
 def arm_at_rest(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from lost_commits import lose_commit
 from slots import put_online as put
 
 from actors.geometry.arms.kinematics import capsules_at
@@ -101,6 +102,22 @@ def test_a_background_is_learned_after_the_word_and_not_before(cell, random):
     assert found.frames == 5
     assert np.abs(found.mean.astype(int) - 120).max() <= 3
     assert found.spread.min() >= 0
+
+
+def test_a_background_whose_commit_fails_comes_with_the_next_image(cell, random):
+    """It is not learned anew from the first image on."""
+    learning = actor_of(BackgroundLearning, images=5)
+    put(cell, WORKSPACE, EMPTY, PERIOD_NS)
+    learn(cell, learning, random, 2, 4)
+    put(cell, CAMERA, IMAGE, image_of(random), 6 * PERIOD_NS)
+    lose_commit(learning, cell)
+    assert seen(cell, CAMERA, BACKGROUND) is None
+    learn(cell, learning, random, 7, 1)
+    found, stamp_ns = seen(cell, CAMERA, BACKGROUND)
+    assert (found.frames, stamp_ns) == (6, 7 * PERIOD_NS)
+    put(cell, WORKSPACE, EMPTY, 8 * PERIOD_NS)
+    learn(cell, learning, random, 9, 4)
+    assert seen(cell, CAMERA, BACKGROUND)[1] == stamp_ns
 
 
 ROOM = Calibration(
