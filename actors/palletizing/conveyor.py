@@ -102,39 +102,37 @@ class BeltConveyor(Actor):
 
     def __init__(self, controller: str) -> None:
         self.belt: BeltController = open_controller(controller)
-        self._runs_s = self._free_s = 0.0
+        self._runs_for, self._runs_s, self._free_s = -1, 0.0, 0.0
 
     def update(self, lock: Lock) -> None:
         """Start the belt, or say that a package has come."""
-        last, plans = lock.get(self.arrival), lock[self.plans]
-        number = 0 if last is None else last.number + 1
-        request, attached = lock.get(self.request), lock.get(self.attached)
-        outcome, results = lock.get(self.outcome), lock.get(self.results, {})
-        came = None if last is None else Came(last, request, attached, outcome, results)
-        if came is not None and not self._runs_s and (again := self._again(came)) is not None:
+        last, plans, trained = lock.get(self.arrival), lock[self.plans], lock[self.grasps].keys()
+        number, came = 0, None
+        if last is not None:
+            request, attached = lock.get(self.request), lock.get(self.attached)
+            outcome, results = lock.get(self.outcome), lock.get(self.results, {})
+            number, came = last.number + 1, Came(last, request, attached, outcome, results)
+        runs, is_planned = self._runs_for == number, place_entity(number) in plans
+        if came is not None and not runs and (again := self._again(came)) is not None:
             lock[self.arrival] = again
+        elif not is_planned or lock.is_null(self.empty):
             return
-        if place_entity(number) not in plans or lock.is_null(self.empty):
-            return
-        if not self._runs_s:
-            trained = lock[self.grasps].keys()
-            if any(product_entity(plan.product) not in trained for plan in plans.values()):
-                return
+        elif runs and self.belt.arrived():
+            lock[self.arrival] = Arrival(number, time.time_ns())
+        elif runs and time.monotonic() - self._runs_s > LATE_S:
+            print(f"package {number} has not come for {LATE_S:g} s; the belt is run again")
+            self._run(number)
+        elif not runs and all(product_entity(plan.product) in trained for plan in plans.values()):
             is_last = came is not None and came.ends_tray(plans)
             if came is None or came.is_off(lock.get(self.planned), ends_tray=is_last):
                 if is_last:
                     self.belt.change_tray()
-                self._run()
-        elif self.belt.arrived():
-            lock[self.arrival] = Arrival(number, time.time_ns())
-            self._runs_s = 0.0
-        elif time.monotonic() - self._runs_s > LATE_S:
-            print(f"package {number} has not come for {LATE_S:g} s; the belt is run again")
-            self._run()
+                self._run(number)
 
-    def _run(self) -> None:
+    def _run(self, number: int) -> None:
+        """Run the belt for a package: until the world knows that it has arrived."""
         self.belt.run_belt()
-        self._runs_s = time.monotonic()
+        self._runs_for, self._runs_s = number, time.monotonic()
 
     def _again(self, came: Came) -> Arrival | None:
         """Return what came last as it is reported again, None if it need not be."""

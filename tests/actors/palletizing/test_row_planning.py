@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from lost_commits import lose_commit
 
 pytest.importorskip("open3d", exc_type=ImportError)
 pytest.importorskip("mujoco", exc_type=ImportError)
@@ -198,6 +199,19 @@ def test_what_is_taken_out_of_the_light_barrier_unrecognised_is_reported(cell, m
     planned(cell)
     testing.run_once(conveyor, cell)
     assert belt.runs == 1
+
+
+def test_an_arrival_is_reported_until_it_stands(cell, monkeypatch):
+    """Its commit fails: the belt is not run again under the package in the light barrier."""
+    belt = Belt()
+    monkeypatch.setattr("actors.palletizing.conveyor.open_controller", lambda _: belt)
+    conveyor = BeltConveyor("any")
+    write(cell, words.BELT, words.EMPTY, empty_belt(), "training")
+    testing.run_once(conveyor, cell)
+    lose_commit(conveyor, cell)
+    assert read(cell, words.CONVEYOR, words.ARRIVAL) is None
+    testing.run_once(conveyor, cell)
+    assert (belt.runs, read(cell, words.CONVEYOR, words.ARRIVAL).number) == (1, 0)
 
 
 def two_on_a_tray(cell, monkeypatch):
