@@ -66,8 +66,8 @@ class Operator(Actor):
         path = Path(answers) if answers else None
         self.answers = path.read_text().split() if path and path.is_file() else answers.split()
         self.hands: Hands | None = open_controller(hands) if hands else None
-        self._lines: queue.SimpleQueue[str] | None = None
-        self._asked = -1
+        self._terminal, self._asked = Terminal(), -1
+        self._answer: Decision | None = None
 
     def update(self, lock: Lock) -> None:
         """Answer the newest question, if it has no answer."""
@@ -77,25 +77,45 @@ class Operator(Actor):
         if self.answers and before is not None and before.choice == "stop":
             return  # what a script has stopped goes on when a person says so
         if question.request != self._asked:
-            print(f"{question.text}\n  {' | '.join(question.choices)}", flush=True)
-            self._asked = question.request
-            while self._lines is not None and not self._lines.empty():
-                self._lines.get_nowait()  # typed before this question was asked
+            self._terminal.ask(question)
+            self._asked, self._answer = question.request, None
+        if self._answer is None:
+            self._answer = self._decided(question, lock)
+        if self._answer is not None:
+            lock[self.decision] = self._answer
+
+    def _decided(self, question: Question, lock: Lock) -> Decision | None:
+        """Return the answer, None if there is none yet; what it wants done by hand is done."""
         if self.answers:
             looks = lock[self.request].tried.count("look")
-            choice, why = scripted(question, self.answers, looks)
+            by, (choice, why) = SCRIPT, scripted(question, self.answers, looks)
         else:
-            choice, why = self._typed(question), ""
+            by, choice, why = "terminal", self._terminal.typed(question), ""
         if not choice:
-            return
+            return None
         if choice == "removed" and self.hands is not None:
-            self._remove(lock)
+            package = lock[self.request].package
+            seen = lock[self.sightings].get(Entity(package)) if package else None
+            if seen is not None:
+                self.hands.remove(seen.first_stop)
         print(f"  {choice}{why}", flush=True)
-        by = SCRIPT if self.answers else "terminal"
-        lock[self.decision] = Decision(question.request, choice, by)
+        return Decision(question.request, choice, by)
 
-    def _typed(self, question: Question) -> str:
-        """Return what was typed, if it is a choice; never wait for it, since the lock would."""
+
+class Terminal:
+    """Where a person reads questions and types answers."""
+
+    def __init__(self) -> None:
+        self._lines: queue.SimpleQueue[str] | None = None
+
+    def ask(self, question: Question) -> None:
+        """Print a question; what was typed before is no answer to it."""
+        print(f"{question.text}\n  {' | '.join(question.choices)}", flush=True)
+        while self._lines is not None and not self._lines.empty():
+            self._lines.get_nowait()
+
+    def typed(self, question: Question) -> str:
+        """Return what was typed, if it is a choice; never wait for it, since a lock would."""
         if self._lines is None:
             self._lines = queue.SimpleQueue()
             threading.Thread(target=_read, args=(self._lines,), daemon=True).start()
@@ -107,12 +127,6 @@ class Operator(Actor):
             return word
         print(f"  {word!r} is none of {', '.join(question.choices)}", flush=True)
         return ""
-
-    def _remove(self, lock: Lock) -> None:
-        request = lock[self.request]
-        seen = lock[self.sightings].get(Entity(request.package)) if request.package else None
-        if seen is not None and self.hands is not None:
-            self.hands.remove(seen.first_stop)
 
 
 def scripted(question: Question, answers: Sequence[str], looks: int) -> tuple[str, str]:

@@ -1,9 +1,12 @@
 """What feedback decides, what it asks, and what the operator may answer."""
 
+import io
 from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
+from lost_commits import lose_commit
+from polling import until
 from rich.console import Console
 
 pytest.importorskip("open3d", exc_type=ImportError)
@@ -188,6 +191,23 @@ def test_an_arm_that_did_not_come_aside_is_asked_about(cell):
     question = read(cell, words.USER, words.QUESTION)
     assert question.text == "place/0: the arm is not aside: blocked"
     assert "look" in question.choices
+
+
+def test_an_answer_that_was_typed_is_given_until_it_stands(cell, monkeypatch):
+    """Its commit fails: nobody has to type it again, and nothing is removed twice."""
+    removed = []
+    hands = SimpleNamespace(remove=removed.append)
+    monkeypatch.setattr("actors.palletizing.operator.open_controller", lambda _: hands)
+    monkeypatch.setattr("sys.stdin", io.StringIO("removed\n"))
+    operator = Operator(hands="any")
+    placed(cell)
+    looked(cell, "tray", "deformed")
+    testing.run_once(HandlingFeedback(), cell)
+    until(lambda: lose_commit(operator, cell) or removed)
+    assert read(cell, words.SYSTEM, words.DECISION) is None
+    testing.run_once(operator, cell)
+    decision = read(cell, words.SYSTEM, words.DECISION)
+    assert (decision.choice, decision.by, removed) == ("removed", "terminal", [0])
 
 
 @pytest.mark.parametrize(("answer", "done"), [("reject", "rejected"), ("removed", "removed")])
