@@ -10,7 +10,6 @@ import time
 from typing import TYPE_CHECKING
 
 from actors.geometry.open3d_on_use import open3d
-from actors.geometry.poses import inverse
 from actors.palletizing.handling.stages import (
     ASIDE,
     NOT_ASIDE,
@@ -18,7 +17,7 @@ from actors.palletizing.handling.stages import (
     is_on_belt_first,
     way_aside,
 )
-from actors.palletizing.sight.belt_sight import BeltLooks, BeltWatch
+from actors.palletizing.sight.belt_sight import BeltWatch
 from actors.palletizing.sight.sensor import FRAMES as FRAMES_FUSED
 from actors.palletizing.sight.sensor import SensorError, Watched, open_sensor
 from actors.palletizing.sight.tray_changes import tray_alone
@@ -37,6 +36,7 @@ from actors.palletizing.vocabulary import (
     GRIPPER,
     LAST,
     LOOK,
+    LOOKS,
     NET,
     OBSERVATION,
     OUTCOME,
@@ -52,9 +52,9 @@ from actors.palletizing.vocabulary import (
     SURFACE,
     SYSTEM,
     TRAY,
+    BeltLooks,
     Look,
     Sight,
-    Sighting,
     place_entity,
     product_entity,
 )
@@ -115,6 +115,7 @@ class HandlingPerception(Actor):
     empty_tray = View(training, TRAY, EMPTY)
     empty_belt = View(training, BELT, EMPTY)
     cell_frames = View(training, CELL, FRAMES)
+    looks = Write(online, CONVEYOR, LOOKS)
     last = Write(online, TRAY, LAST)
     look = Write(online, SYSTEM, LOOK)
     sight = Write(online, CONVEYOR, SIGHT)
@@ -126,7 +127,6 @@ class HandlingPerception(Actor):
     def __init__(self, belt_sensor: str, tray_sensor: str, frames: int = FRAMES_FUSED) -> None:
         self.belt_sensor = Watched(open_sensor(belt_sensor), "the belt sensor", frames)
         self.tray_sensor = Watched(open_sensor(tray_sensor), "the tray sensor", frames)
-        self._belt_looks = BeltLooks()
 
     def start(self) -> None:
         """Load Open3D before the first package comes: it takes a second or two."""
@@ -138,7 +138,7 @@ class HandlingPerception(Actor):
         attached, before = lock.get(self.attached), lock.get(self.look)
         net, ended = way_aside(attached, lock.get(self.execution))
         aside = net if ended == ASIDE else 0
-        if arrival is not None and self._belt_looks.is_due(arrival, aside):
+        if arrival is not None and lock.get(self.looks, BeltLooks()).is_due(arrival, aside):
             self._see_arrival(lock, arrival, aside)
         if outcome is None or attached is None or attached.request != outcome.request or not ended:
             return
@@ -165,8 +165,9 @@ class HandlingPerception(Actor):
             except SensorError as failed:
                 print(failed, flush=True)
                 failure = str(failed)
-        looks = self._belt_looks.after(arrival, aside, seen=seen, failed=bool(failure))
-        self._belt_looks, error = looks, failure or looks.error(is_gone=arrival.is_gone)
+        looks = lock.get(self.looks, BeltLooks())
+        looks = looks.after(arrival, aside, seen=seen, failed=bool(failure))
+        lock[self.looks], error = looks, failure or looks.error(is_gone=arrival.is_gone)
         if not is_known and (error or lock.get(self.sight) is not None):
             lock[self.sight] = Sight(number, error)
 
@@ -192,10 +193,8 @@ class HandlingPerception(Actor):
         tray = Tray(number, empty, lock[self.models], lock[self.plans], lock[self.sightings])
         last, kind = lock.get(self.last), request.kind
         found = tray_sight(frame, last, tray, package, kind=kind, captured_ns=now_ns)
-        for each, seen in found.sightings.items():
-            lock[self.sightings][each] = seen
-        for each, cloud in found.clouds.items():
-            lock[self.clouds][each] = cloud
+        lock[self.sightings].update(found.sightings)
+        lock[self.clouds].update(found.clouds)
         for place, observed in found.observations.items():
             lock[self.observations].put(place, observed, stamp_ns=now_ns)
         lock[self.last] = frame
@@ -207,20 +206,11 @@ class HandlingPerception(Actor):
 
     def _see_belt(self, lock: Lock, package: Entity, number: int) -> bool:
         """Look for a package on the belt; return whether there is one."""
-        before, frames = lock[self.sightings].get(package), lock.get(self.cell_frames)
-        between = None if frames is None else inverse(frames["belt"]) @ frames["tray"]
-        models = {
-            product.name.removeprefix("product/"): surface
-            for product, surface in lock[self.models].items()
-        }
-        product = "" if before is None else before.product
-        watch = BeltWatch(lock[self.empty_belt], models, between)
-        sight = watch.sight(self.belt_sensor.image(number), product)
-        if sight is None:
-            return False
-        plan = lock[self.plans].get(place_entity(number))
-        lock[self.sightings][package] = Sighting(
-            0 if plan is None else plan.tray, sight.belt_from_product, number, number, "belt",
-            sight.product if sight.known else product, sight.unfit,
-        )  # fmt: skip
-        return True
+        before, plan = lock[self.sightings].get(package), lock[self.plans].get(place_entity(number))
+        product, tray = "" if before is None else before.product, 0 if plan is None else plan.tray
+        empty, models, frames = lock[self.empty_belt], lock[self.models], lock.get(self.cell_frames)
+        image = self.belt_sensor.image(number)
+        sight = BeltWatch.of(empty, models, frames).sight(image, product)
+        if sight is not None:
+            lock[self.sightings][package] = sight.sighting(number, tray, product)
+        return sight is not None

@@ -40,6 +40,7 @@ from actors.geometry.recognition.deviation import Limits
 from actors.geometry.shapes import Acquisition, DepthFrame, PointCloud, Surface
 from actors.palletizing.handling.data import Arrival as Arrival  # noqa: PLC0414
 from actors.palletizing.handling.data import Attached as Attached  # noqa: PLC0414
+from actors.palletizing.handling.data import BeltLooks as BeltLooks  # noqa: PLC0414
 from actors.palletizing.handling.data import Candidate as Candidate  # noqa: PLC0414
 from actors.palletizing.handling.data import Control as Control  # noqa: PLC0414
 from actors.palletizing.handling.data import Decision as Decision  # noqa: PLC0414
@@ -256,6 +257,8 @@ ARRIVAL: Final = Aspect("arrival", Arrival)
 """What has come last (conveyor)."""
 SIGHT: Final = Aspect("sight", Sight)
 """Whether what came last was seen (conveyor)."""
+LOOKS: Final = Aspect("looks", BeltLooks)
+"""The looks at the belt for what came last (conveyor)."""
 REQUEST: Final = Aspect("request", Request)
 """What the robot shall do (system)."""
 CANDIDATE: Final = Aspect("candidate", Candidate)

@@ -6,11 +6,19 @@
 # The wire reads these annotations: they stay real types, without `from __future__`.
 
 from dataclasses import dataclass
+from typing import Final, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from actors.palletizing.handling.nets import Net
+
+UNSEEN_LOOKS: Final = 3
+"""After so many looks that show nothing of what has come, the sight says so as an error."""
+UNRECOGNISED: Final = "something is in the light barrier, but no package is recognised there"
+"""What follows from looks at the belt, again and again, that show nothing."""
+TAKEN_OUT: Final = "it was taken out of the light barrier: nothing is seen on the belt"
+"""Why what has come is not asked about any more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,6 +159,52 @@ class Sight:
 
     number: int
     error: str
+
+
+@dataclass(frozen=True, slots=True)
+class BeltLooks:
+    """The looks at the belt for what has come, and what they have shown (conveyor).
+
+    Attributes:
+        arrived_ns: Stamp of the arrival of the last one, nanoseconds since 1970.
+        aside: Number of the net that had taken the arm aside before it; 0: none had.
+        number: Of the package that it was for.
+        unseen: How many for that package have shown nothing.
+        is_seen: Whether the package is known now.
+    """
+
+    arrived_ns: int = 0
+    aside: int = 0
+    number: int = -1
+    unseen: int = 0
+    is_seen: bool = True
+
+    def is_due(self, arrival: Arrival, aside: int) -> bool:
+        """Return whether to look for what has come.
+
+        At once, and as long as it was not seen, each time the arm has gone aside: an arm that
+        stopped above the belt hides it.
+        """
+        again = not self.is_seen and aside not in {0, self.aside}
+        return arrival.stamp_ns != self.arrived_ns or again
+
+    def after(self, arrival: Arrival, aside: int, *, seen: bool, failed: bool) -> Self:
+        """Return the looks after another one, which the sensor may have failed to take."""
+        before = self.unseen if arrival.number == self.number else 0
+        unseen = before + (not seen and not failed)
+        return type(self)(arrival.stamp_ns, aside, arrival.number, unseen, seen)
+
+    def error(self, *, is_gone: bool) -> str:
+        """Return why the package is not known, in one line; empty if it is, or may be soon.
+
+        Args:
+            is_gone: It was taken out of the light barrier.
+        """
+        if self.is_seen:
+            return ""
+        if is_gone:
+            return TAKEN_OUT
+        return UNRECOGNISED if self.unseen >= UNSEEN_LOOKS else ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,7 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from actors.palletizing.handling.data import TAKEN_OUT, UNRECOGNISED
 from actors.palletizing.handling.reactions import (
     BY_ITSELF,
     CANNOT,
@@ -31,8 +32,6 @@ from actors.palletizing.handling.stages import (
     NOT_ASIDE,
     RISKY,
     STANDS,
-    TAKEN_OUT,
-    UNRECOGNISED,
     along_and_across,
     felt_on,
     is_current,

@@ -80,10 +80,6 @@ GONE: Final = {"reject": "rejected", "removed": "removed"}
 """Requests after which the package shall be seen nowhere, and what became of it then."""
 NOT_ASIDE: Final = "the arm is not aside: "
 """What a look at the tray needs, and lacks."""
-UNRECOGNISED: Final = "something is in the light barrier, but no package is recognised there"
-"""What follows from looks at the belt, again and again, that show nothing."""
-TAKEN_OUT: Final = "it was taken out of the light barrier: nothing is seen on the belt"
-"""Why what has come is not asked about any more."""
 IDLE: Final = ("stop", "ask")
 """Kinds of requests that move nothing."""
 

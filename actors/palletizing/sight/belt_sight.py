@@ -23,8 +23,8 @@ from actors.geometry.recognition.segmentation import Piece, new_pieces
 from actors.geometry.shapes import DepthFrame
 from actors.geometry.surfaces.depth import frame_points, median_known, metres
 from actors.geometry.surfaces.rendering import render_depth
-from actors.palletizing.handling.stages import TAKEN_OUT, UNRECOGNISED
 from actors.palletizing.placing.rows import TRAY_HALF_M
+from actors.palletizing.vocabulary import Sighting
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from actors.geometry.shapes import Surface
-    from actors.palletizing.vocabulary import Arrival
+    from enact_dist import Entity
 
     Pose = npt.NDArray[np.float64]
     Mask = npt.NDArray[np.bool_]
@@ -59,9 +59,6 @@ MISFIT_MAX_M: Final = 0.003
 HEIGHT_OFF_M: Final = 0.035
 """A product whose height differs by more is not tried: no crush takes so much."""
 
-UNSEEN_LOOKS: Final = 3
-"""After so many looks that show nothing of what has come, the sight says so as an error."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BeltSight:
@@ -84,6 +81,18 @@ class BeltSight:
     def known(self) -> bool:
         """Whether it is that product, whole and upright; what is not is for the operator."""
         return bool(self.product) and self.misfit_m <= MISFIT_MAX_M and not self.tilt_rad
+
+    def sighting(self, number: int, tray: int, product: str) -> Sighting:
+        """Return where a package was seen.
+
+        Args:
+            number: Of its arrival.
+            tray: That it is for.
+            product: What it is, if it is not known now; "" if it never was.
+        """
+        product = self.product if self.known else product
+        pose = self.belt_from_product
+        return Sighting(tray, pose, number, number, "belt", product, self.unfit)
 
     @property
     def unfit(self) -> str:
@@ -111,6 +120,18 @@ class BeltWatch:
     models: Mapping[str, Surface]
     belt_from_tray: Pose | None = None
 
+    @classmethod
+    def of(
+        cls,
+        empty: DepthFrame,
+        models: Mapping[Entity, Surface],
+        frames: Mapping[str, Pose] | None,
+    ) -> BeltWatch:
+        """Return the watch of a cell: surfaces by product, and where belt and tray stand."""
+        names = {one.name.removeprefix("product/"): surface for one, surface in models.items()}
+        between = None if frames is None else inverse(frames["belt"]) @ frames["tray"]
+        return cls(empty, names, between)
+
     def sight(self, frame: DepthFrame, product: str) -> BeltSight | None:
         """Return the sight that is of a package, None if none can be.
 
@@ -129,52 +150,6 @@ class BeltWatch:
             return next(iter(sights), None)
         upright = [sight for sight in sights if sight.known and sight.product == product]
         return next(iter(upright or [sight for sight in sights if not sight.known]), None)
-
-
-@dataclass(frozen=True, slots=True)
-class BeltLooks:
-    """The looks at the belt for what has come, and what they have shown.
-
-    Attributes:
-        arrived_ns: Stamp of the arrival of the last one, nanoseconds since 1970.
-        aside: Number of the net that had taken the arm aside before it; 0: none had.
-        number: Of the package that it was for.
-        unseen: How many for that package have shown nothing.
-        is_seen: Whether the package is known now.
-    """
-
-    arrived_ns: int = 0
-    aside: int = 0
-    number: int = -1
-    unseen: int = 0
-    is_seen: bool = True
-
-    def is_due(self, arrival: Arrival, aside: int) -> bool:
-        """Return whether to look for what has come.
-
-        At once, and as long as it was not seen, each time the arm has gone aside: an arm that
-        stopped above the belt hides it.
-        """
-        again = not self.is_seen and aside not in {0, self.aside}
-        return arrival.stamp_ns != self.arrived_ns or again
-
-    def after(self, arrival: Arrival, aside: int, *, seen: bool, failed: bool) -> BeltLooks:
-        """Return the looks after another one, which the sensor may have failed to take."""
-        before = self.unseen if arrival.number == self.number else 0
-        unseen = before + (not seen and not failed)
-        return BeltLooks(arrival.stamp_ns, aside, arrival.number, unseen, seen)
-
-    def error(self, *, is_gone: bool) -> str:
-        """Return why the package is not known, in one line; empty if it is, or may be soon.
-
-        Args:
-            is_gone: It was taken out of the light barrier.
-        """
-        if self.is_seen:
-            return ""
-        if is_gone:
-            return TAKEN_OUT
-        return UNRECOGNISED if self.unseen >= UNSEEN_LOOKS else ""
 
 
 def seen_on_belt(

@@ -15,7 +15,7 @@ pytest.importorskip("mujoco", exc_type=ImportError)
 from actors.palletizing import vocabulary as words
 from actors.palletizing.demo.packing import follow
 from actors.palletizing.feedback import HandlingFeedback
-from actors.palletizing.handling.stages import TAKEN_OUT, UNRECOGNISED
+from actors.palletizing.handling.data import TAKEN_OUT, UNRECOGNISED
 from actors.palletizing.operator import LOOKS, Operator
 from actors.running_cell import DemoError
 from enact_dist import Entity, testing

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from lost_commits import lose_commit
 
 pytest.importorskip("open3d", exc_type=ImportError)
 pytest.importorskip("mujoco", exc_type=ImportError)
@@ -12,12 +13,11 @@ from slots import put_online as write
 from actors.geometry.poses import turned
 from actors.palletizing import vocabulary as words
 from actors.palletizing.deviation import DeviationDetection
+from actors.palletizing.handling.data import TAKEN_OUT, UNRECOGNISED, UNSEEN_LOOKS
 from actors.palletizing.handling.grounding import aside_net
 from actors.palletizing.handling.nets import Execution
-from actors.palletizing.handling.stages import TAKEN_OUT, UNRECOGNISED
 from actors.palletizing.handling_perception import EmptyBelt, HandlingPerception
 from actors.palletizing.planning import RowPlanning
-from actors.palletizing.sight.belt_sight import UNSEEN_LOOKS
 from actors.palletizing.sight.sensor import SensorError
 from actors.palletizing.simulation.cell.scene import CellLayout
 from actors.palletizing.simulation.physical_sensors import PhysicalBeltSensor, PhysicalTraySensor
@@ -273,6 +273,17 @@ def test_a_package_that_the_belt_sensor_does_not_show_is_not_forgotten(cell, phy
     ended(cell, 2, "", "place/0", kind="look")
     testing.run_once(perception, cell)
     assert get(cell.world("online"), words.SYSTEM, words.LOOK).error == ""
+    assert len(each(cell.world("online"), words.PACKAGES, words.SIGHTING)) == 1
+
+
+def test_what_has_come_is_looked_for_until_its_sighting_stands(cell, physical):
+    """The commit of the first look fails: without a second one the package would have no entity."""
+    perception = HandlingPerception("belt", "tray", frames=2)
+    on_belt(physical, 0)
+    write(cell, words.CONVEYOR, words.ARRIVAL, words.Arrival(0, 7))
+    lose_commit(perception, cell)
+    assert each(cell.world("online"), words.PACKAGES, words.SIGHTING) == {}
+    testing.run_once(perception, cell)
     assert len(each(cell.world("online"), words.PACKAGES, words.SIGHTING)) == 1
 
 

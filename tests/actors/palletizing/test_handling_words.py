@@ -26,6 +26,7 @@ NET = net(
         (words.SYSTEM, words.OUTCOME, words.Outcome(1, "push", "in_contact", True, 7)),
         (words.SYSTEM, words.LOOK, words.Look(1, "tray", 7, ("place/0", "place/1"))),
         (words.CONVEYOR, words.SIGHT, words.Sight(0, "the belt sensor gave no image: unplugged")),
+        (words.CONVEYOR, words.LOOKS, words.BeltLooks(7, 2, 3, 1, is_seen=False)),
         (words.CELL, words.PLANNED, words.Planned({"place/0": "rejected"}, (0,))),
         (words.USER, words.QUESTION, words.Question(1, "what now?", ("reject", "stop"))),
         (words.SYSTEM, words.DECISION, words.Decision(1, "reject", "a test")),

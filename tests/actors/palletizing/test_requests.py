@@ -10,8 +10,8 @@ pytest.importorskip("mujoco", exc_type=ImportError)
 
 from actors.palletizing import vocabulary as words
 from actors.palletizing.feedback import notice_of
+from actors.palletizing.handling.data import TAKEN_OUT, UNRECOGNISED
 from actors.palletizing.handling.requests import FollowUp, Said, Situation, follow_up
-from actors.palletizing.handling.stages import TAKEN_OUT, UNRECOGNISED
 from actors.palletizing.operator import LOOKS, scripted
 from enact_dist import Entity
 

@@ -7,15 +7,13 @@ pytest.importorskip("open3d", exc_type=ImportError)
 
 from actors.geometry.poses import on_tray
 from actors.palletizing import vocabulary as words
+from actors.palletizing.handling.data import TAKEN_OUT, UNRECOGNISED, UNSEEN_LOOKS
 from actors.palletizing.handling.grounding import aside_net
 from actors.palletizing.handling.nets import Execution
 from actors.palletizing.handling.stages import (
-    TAKEN_OUT,
-    UNRECOGNISED,
     is_on_belt_first,
     way_aside,
 )
-from actors.palletizing.sight.belt_sight import UNSEEN_LOOKS, BeltLooks
 from actors.palletizing.sight.tray_sight import GONE_M, Tray, tray_sight
 from enact_dist import Entity
 
@@ -96,7 +94,7 @@ def test_what_is_far_from_where_a_package_shall_be_gone_is_something_else(tray):
 
 def test_the_belt_is_looked_at_once_and_again_whenever_the_arm_has_gone_aside():
     """What was not seen may have been hidden; what is known is not looked for again."""
-    arrival, looks = words.Arrival(3, 7), BeltLooks()
+    arrival, looks = words.Arrival(3, 7), words.BeltLooks()
     assert looks.is_due(arrival, 0)
     unseen = looks.after(arrival, 0, seen=False, failed=False)
     assert [unseen.is_due(arrival, aside) for aside in (0, 5)] == [False, True]
@@ -108,7 +106,7 @@ def test_the_belt_is_looked_at_once_and_again_whenever_the_arm_has_gone_aside():
 
 def test_looks_that_show_nothing_end_in_an_error():
     """A look that the sensor failed to take does not count, and the next package starts anew."""
-    arrival, looks = words.Arrival(3, 7), BeltLooks()
+    arrival, looks = words.Arrival(3, 7), words.BeltLooks()
     errors = []
     for failed in (True, *[False] * UNSEEN_LOOKS):
         looks = looks.after(arrival, 0, seen=False, failed=failed)
