@@ -32,7 +32,7 @@ from enact_dist import Actor, View, World, Write
 
 if TYPE_CHECKING:
     from actors.palletizing.handling.nets import Execution
-    from actors.palletizing.vocabulary import Attached, Control
+    from actors.palletizing.vocabulary import Attached
     from enact_dist import Lock, Outcome
 
 LEASE_S: Final = 2.0
@@ -116,10 +116,9 @@ class RobotJoints(Actor):
             raise ValueError(f"lease_s is {lease_s}; it has to be more than 0 s")
         self.controller, self.lease_s, self.every_s = controller, lease_s, every_s
         self.urgent = urgent
-        self._told: Execution | None = None
-        self._ended: Execution | None = None
-        self._ticks = 0
-        self._locked_ms = 0.0
+        self._told: tuple[Execution | None, int] = None, 0
+        """The state of an execution that was published last, and its version if that stands."""
+        self._ticks, self._locked_ms = 0, 0.0
 
     def start(self) -> None:
         """Open the arm."""
@@ -139,52 +138,37 @@ class RobotJoints(Actor):
 
     def update(self, lock: Lock) -> None:
         """Publish what is new."""
-        began_s = time.monotonic()
-        loop = _loops[self.controller]
-        gripper = lock.get(self.gripper)
+        began_s, loop = time.monotonic(), _loops[self.controller]
+        gripper, command = lock.get(self.gripper), lock.get(self.command)
         if self._ticks == 0:
-            numbers = [one.number for one in (gripper, lock.get(self.command)) if one is not None]
+            numbers = [one.number for one in (gripper, command) if one is not None]
             loop.grip_number = max(numbers, default=0)
         loop.reached(gripper)
         self._tell_execution(lock, loop)
-        grip = loop.grip
-        if grip is not None and lock.get(self.command) != grip:
+        if (grip := loop.grip) is not None and command != grip:
             lock[self.command] = grip
-        joints = loop.joints() if self._ticks % JOINTS_TICKS == 0 else None
-        if joints is not None:
+        if self._ticks % JOINTS_TICKS == 0 and (joints := loop.joints()) is not None:
             lock[self.joints] = joints
         if self._ticks % CONTROL_TICKS == 0:
-            lock[self.control] = self.figures(loop)
+            lock[self.control] = replace(loop.figures(), locked_ms=self._locked_ms)
         self._ticks += 1
         self._locked_ms = max(self._locked_ms, 1e3 * (time.monotonic() - began_s))
 
-    def figures(self, loop: ControlLoop) -> Control:
-        """Return what the periods of the loop were, and how long this actor held its lock."""
-        return replace(loop.figures(), locked_ms=self._locked_ms)
-
     def _tell_execution(self, lock: Lock, loop: ControlLoop) -> None:
-        """Publish the result of each net, then how far the present one is.
-
-        A result is published until the world has it, since a commit can fail after the update.
-        """
-        if self._ended is not None and _is(lock.get(self.execution), self._ended):
-            self._ended = None
-        if self._ended is None and loop.ended:
-            self._ended = loop.ended.popleft()
-        if self._ended is not None:
-            lock[self.execution] = self._ended
-        elif loop.execution not in (None, self._told) and not loop.execution.result:
-            lock[self.execution] = self._told = loop.execution
-        else:
-            over = unexecuted(
-                lock.get(self.net),
-                lock.get(self.net_outcome),
-                lock.get(self.execution),
-                version=lock.version(self.net),
-                begun_here=loop.execution is not None,
-            )
-            if over is not None:
-                lock[self.execution] = over
+        """Publish the result of each net until it stands, then how far the present one is."""
+        found, version = lock.get(self.execution), lock.version(self.execution)
+        while loop.ended and _is(found, loop.ended[0]):
+            loop.ended.popleft()
+        doing, told = loop.execution, loop.ended[0] if loop.ended else None
+        if told is None:
+            if doing is not None and not doing.result and self._told != (doing, version):
+                told, self._told = doing, (doing, version + 1)
+            else:
+                net, outcome = lock.get(self.net), lock.get(self.net_outcome)
+                number, is_begun = lock.version(self.net), doing is not None
+                told = unexecuted(net, outcome, found, version=number, begun_here=is_begun)
+        if told is not None:
+            lock[self.execution] = told
 
 
 def unexecuted(

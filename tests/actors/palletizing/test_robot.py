@@ -8,7 +8,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from lost_commits import lose_commit
 from polling import until
+from slots import put
 
 from actors.palletizing import gripper as gripper_module
 from actors.palletizing import robot
@@ -117,9 +119,8 @@ class Trial:
 
     def attach(self, going, frames=None):
         self.attached += 1
-        request = Write(self.online, SYSTEM, NET)
-        with Lock(request) as lock:
-            lock[request] = Attached(self.attached, 1, "grasp", going, frames or {})
+        net_of = Attached(self.attached, 1, "grasp", going, frames or {})
+        put(self.online, SYSTEM, NET, net_of)
 
     def get(self, entity, aspect):
         request = View(self.online, entity, aspect)
@@ -365,24 +366,30 @@ def test_net_that_an_earlier_process_had_begun_does_not_go_on(trial):
     with trial.running():
         trial.attach(endless())
         begun = trial.until(ROBOT, EXECUTION, lambda now: now.net_version == 1)
-    request = Write(trial.online, ROBOT, EXECUTION)
-    with Lock(request) as lock:
-        lock[request] = begun  # as a killed process leaves it
+    put(trial.online, ROBOT, EXECUTION, begun)  # as a killed process leaves it
 
     testing.run_once(trial.actors()[0], trial.cell)
-
     done = trial.get(ROBOT, EXECUTION)
     assert (done.result, done.net_version) == ("interrupted:drift", 1)
     assert done.trace[-1].because == "the robot was started again"
+
+
+def test_execution_is_published_until_it_stands(trial, monkeypatch):
+    """The commit fails: the loop has no newer state, and this one is written all the same."""
+    joints = trial.actors()[0]
+    joints.start()
+    monkeypatch.setattr(joints, "start", lambda: None)
+    robot._loops[trial.address].execution = execution(1, "")
+    lose_commit(joints, trial.cell)
+    testing.run_once(joints, trial.cell)
+    assert trial.get(ROBOT, EXECUTION).net_version == 1
 
 
 def test_net_that_was_taken_and_not_begun_ends_too(trial):
     """A process that was killed between taking a net and its first cycle leaves no riddle."""
     trial.attach(endless())
     trial.online.init(ROBOT, NET_OUTCOME, Outcome("interrupted", 1, 1))
-
     testing.run_once(trial.actors()[0], trial.cell)
-
     assert trial.get(ROBOT, EXECUTION).result == "interrupted:drift"
 
 
@@ -397,9 +404,8 @@ def test_net_that_the_robot_did_not_execute_ends_by_name(trial, state, earlier):
                 trial.attach(going(0.05))
                 trial.ended()
         trial.attach(endless())
-        outcome = Write(trial.online, ROBOT, NET_OUTCOME)
-        with Lock(outcome) as lock:
-            lock[outcome] = Outcome(state, trial.attached, 1, text="no arm is open")
+        outcome = Outcome(state, trial.attached, 1, text="no arm is open")
+        put(trial.online, ROBOT, NET_OUTCOME, outcome)
         done = trial.ended()
 
     assert done.result == f"braked:{state}"
@@ -423,9 +429,7 @@ def test_restarted_gripper_follows_the_newest_command(trial):
         trial.attach(going(tool="width", tool_value=0.1))
         trial.ended()
     trial.device.grips.clear()
-
     testing.run_once(trial.actors()[2], trial.cell)
-
     assert trial.device.grips == [("width", 0.1, 40.0)]
     assert trial.get(GRIPPER, STATE).number == 1
 
@@ -440,18 +444,14 @@ def test_gripper_that_refuses_goes_on_and_one_that_was_lost_is_started_again(tri
         raise ControllerError("asked for 300 mm between the fingers")
 
     device.grip_width = grip_width
-    command = Write(trial.online, GRIPPER, COMMAND)
-    with Lock(command) as lock:
-        lock[command] = GripCommand(1, "width", 0.3)
+    put(trial.online, GRIPPER, COMMAND, GripCommand(1, "width", 0.3))
     for _ in range(2):
         testing.run_once(gripper, trial.cell)
-
     assert calls == [0.3]
     assert trial.get(GRIPPER, STATE).number == 0
     assert capsys.readouterr().out == "command 1 is refused: asked for 300 mm between the fingers\n"
 
-    with Lock(command) as lock:
-        lock[command] = GripCommand(2, "width", 0.1)
+    put(trial.online, GRIPPER, COMMAND, GripCommand(2, "width", 0.1))
     gripped = device.gripped
 
     def away():
@@ -462,7 +462,6 @@ def test_gripper_that_refuses_goes_on_and_one_that_was_lost_is_started_again(tri
         testing.run_once(gripper, trial.cell)
     device.gripped, device.grip_width = gripped, width
     testing.run_once(gripper, trial.cell)
-
     assert device.grips == [("width", 0.1, 40.0)]
     assert trial.get(GRIPPER, STATE).number == 2
 
@@ -471,7 +470,6 @@ def test_robot_without_its_arm_says_what_is_missing(trial, monkeypatch):
     """In a process of its own it finds no arm; the error says how to configure it."""
     monkeypatch.setattr(robot, "OPENING_S", 0.01)
     trial.attach(endless())
-
     with pytest.raises(RuntimeError, match='process = "robot"'):
         testing.run_once(Robot(trial.address), trial.cell)
 
