@@ -83,6 +83,11 @@ class WritableEach(EachData[T], MutableMapping[Entity, T]):
             return value
         return super().__getitem__(entity)
 
+    def stamp_ns(self, entity: Entity) -> int:
+        """Return when an entity's datum was captured, or is said to be by this lock."""
+        written = self._block.writing.data.get(self._slots[entity])
+        return super().stamp_ns(entity) if written is None else written.stamp_ns
+
     def __setitem__(self, entity: Entity, datum: T) -> None:
         self.put(entity, datum)
 

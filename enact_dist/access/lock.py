@@ -32,12 +32,10 @@ from enact_dist.errors import (
     MisuseError,
     ReadonlyError,
 )
-from enact_dist.terms import Access, Entity
+from enact_dist.terms import Access
 from enact_dist.wire.payload import encode_parts
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from enact_dist.access.session import Session
     from enact_dist.access.writes import DTypesLike, ShapesLike
     from enact_dist.core.client.lock import MultiLock
@@ -240,7 +238,7 @@ class Lock(Triggered):
     @overload
     def __getitem__(self, request: WriteEach[T]) -> WritableEach[T]: ...
     @overload
-    def __getitem__(self, request: LockRequestEach[T]) -> Mapping[Entity, T]: ...
+    def __getitem__(self, request: LockRequestEach[T]) -> EachData[T]: ...
     @overload
     def __getitem__(self, request: LockRequestOne[T]) -> T: ...
     def __getitem__(self, request: Any) -> Any:

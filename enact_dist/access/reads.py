@@ -370,6 +370,16 @@ class EachData(Mapping[Entity, T]):
         """Say whether there is a datum, without looking at it."""
         return entity in self._slots
 
+    def stamp_ns(self, entity: Entity) -> int:
+        """Return when an entity's datum was captured (0: its writer did not tell); fetches nothing.
+
+        Raises:
+            KeyError: There is no such datum.
+        """
+        self._data.usable()
+        state = self._data.state(self._slots[entity])
+        return state.captured_ns if state is not None else 0
+
     def _fetch(self, slot: Slot) -> None:
         """Fetch a datum, and those behind it where the one before it was fetched last."""
         order = list(self._slots.values())

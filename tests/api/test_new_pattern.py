@@ -23,6 +23,7 @@ def test_entity_is_created_with_an_array_that_is_filled_in_place(online, size):
         cloud[:] = 1
         other = lock[each].new(bench, like=np.zeros((size, 1), np.uint8))
         other[:] = 2
+        assert [lock[each].stamp_ns(entity) for entity in (piece, bench)] == [5, 0]
         assert {entity: int(found.sum()) for entity, found in lock[each].items()} == {
             piece: size,
             bench: 2 * size,
@@ -37,6 +38,9 @@ def test_entity_is_created_with_an_array_that_is_filled_in_place(online, size):
             bench: (size, 1),
         }
         assert (lock[read][piece] == 1).all()
+        assert [lock[read].stamp_ns(entity) for entity in (piece, bench)] == [5, 0]
+        with pytest.raises(KeyError):
+            lock[read].stamp_ns(tray)
     [version] = online.history(piece, CLOUD)
     assert version.stamp_ns == 5
     assert "payload_fallbacks" not in online.session.client.counters
