@@ -9,14 +9,13 @@ writing: `CameraWatch` only looks; `StandIn` locks the silhouette of one dead ca
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar, Final, NamedTuple, Self
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from actors.workcell.vocabulary import (
     ABSENT,
     CALIBRATION,
-    CAMERA_COUNT,
     CAMERA_STATES,
     CAMERAS,
     IMAGES_COMPARED,
@@ -26,13 +25,10 @@ from actors.workcell.vocabulary import (
     SYSTEM,
     CameraState,
     Silhouette,
-    camera_entity,
 )
 from enact_dist import Actor, View, ViewEach, World, Write, WriteEach
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from enact_dist import Entity, Lock
 
 SILENT: Final = "silent"
@@ -103,20 +99,11 @@ class CameraWatch(Actor):
     """
 
     online = World("online")
-    silhouette_0 = View(online, camera_entity(0), SILHOUETTE)
-    silhouette_1 = View(online, camera_entity(1), SILHOUETTE)
-    silhouette_2 = View(online, camera_entity(2), SILHOUETTE)
-    silhouette_3 = View(online, camera_entity(3), SILHOUETTE)
-    silhouette_4 = View(online, camera_entity(4), SILHOUETTE)
-    silhouette_5 = View(online, camera_entity(5), SILHOUETTE)
-    silhouette_6 = View(online, camera_entity(6), SILHOUETTE)
-    silhouette_7 = View(online, camera_entity(7), SILHOUETTE)
+    silhouettes = ViewEach(online, CAMERAS, SILHOUETTE)
     calibrations = ViewEach(online, CAMERAS, CALIBRATION)
     states = Write(online, SYSTEM, CAMERA_STATES)
     absent = WriteEach(online, CAMERAS, ABSENT)
     every_s = PERIOD_S
-
-    _count: ClassVar[int] = CAMERA_COUNT
 
     late_s: float = 0.15
     """Longest time between a tick and the stamp of the newest silhouette."""
@@ -125,65 +112,25 @@ class CameraWatch(Actor):
     foreground_max: float = 0.3
     """Greatest share of foreground that a background still fits."""
 
-    def __init__(self, *, cameras: int | None = None) -> None:
-        if cameras not in (None, self._count):
-            raise ValueError(
-                f"asked for {cameras} cameras; this class is for {self._count};"
-                " CameraWatch.of(cameras) returns another"
-            )
+    def __init__(self) -> None:
         self._seen: dict[Entity, Seen] = {}
-
-    @classmethod
-    def of(cls, cameras: int = CAMERA_COUNT) -> type[Self]:
-        """Return the watch of a cell with so many cameras, 1 or more.
-
-        Raises:
-            ValueError: There are none.
-        """
-        if cameras < 1:
-            raise ValueError(f"cameras is {cameras}; there is nothing to watch")
-        if cameras == cls._count:
-            return cls
-        names: dict[str, object] = dict.fromkeys(map(_attribute, range(cls._count)))
-        for number in range(cameras):
-            names[_attribute(number)] = View(cls.online, camera_entity(number), SILHOUETTE)
-        return type(
-            cls.__name__, (cls,), {**names, "_count": cameras, "__module__": cls.__module__}
-        )
-
-    @classmethod
-    def of_options(cls, options: Mapping[str, object]) -> type[Self]:
-        """Return the watch of a cell by the option `cameras`."""
-        cameras = options.get("cameras")
-        return cls.of(cameras if isinstance(cameras, int) else cls._count)
 
     def update(self, lock: Lock) -> None:
         """Look at the newest silhouettes."""
-        calibrated = lock[self.calibrations].keys()
-        states: dict[str, CameraState] = {}
-        silent = []
-        for number in range(self._count):
-            camera = camera_entity(number)
-            if camera not in calibrated:
-                continue
-            view: View[Silhouette] = getattr(self, _attribute(number))
+        newest = lock[self.silhouettes]
+        states: dict[Entity, CameraState] = {}
+        for camera in lock[self.calibrations]:
             seen = self._seen.get(camera, Seen())
-            newest = lock.get(view)
-            if newest is not None:
-                seen = seen.after(newest, lock.stamp_ns(view))
-            seen, state = seen.state(lock.tick_ns, self.late_s, self.alike_max, self.foreground_max)
-            if state.trouble == SILENT:
-                silent.append(camera)
-            states[camera.name], self._seen[camera] = state, seen
-        lock[self.states] = states
+            if camera in newest:
+                seen = seen.after(newest[camera], newest.stamp_ns(camera))
+            self._seen[camera], states[camera] = seen.state(
+                lock.tick_ns, self.late_s, self.alike_max, self.foreground_max
+            )
+        lock[self.states] = {camera.name: state for camera, state in states.items()}
+        silent = [camera for camera, state in states.items() if state.trouble == SILENT]
         if len(silent) < len(states):
             for camera in silent:
                 lock[self.absent][camera] = lock.tick_ns
-
-
-def _attribute(number: int) -> str:
-    """Return under which name the watch declares the silhouette of a camera."""
-    return f"silhouette_{number}"
 
 
 class StandIn(Actor):

@@ -14,7 +14,6 @@ from actors.workcell.vocabulary import (
 )
 from actors.workcell.watch import CameraWatch, Seen, StandIn
 from enact_dist import Lock, View, Write, testing
-from enact_dist.actor.running.load import make_actor
 
 PERIOD_NS = 100_000_000
 WIDTH, HEIGHT = 36, 20
@@ -164,15 +163,13 @@ def test_image_that_repeats_is_stuck(cell):
     assert cell.states()["camera/2"].trouble == ""
 
 
-@pytest.mark.parametrize("cameras", [2, 4, 12])
-def test_watch_of_another_number_of_cameras(cell, cameras):
-    """The number is an option; those above it are not looked at."""
-    cell.watch = make_actor(CameraWatch, {"cameras": cameras, "late_s": 0.15})
-    cell.tick(0, 1, 2)
-    views = [one for one in type(cell.watch).declaration.requests if "silhouette" in one]
-
-    assert len(views) == cameras
-    assert list(cell.tick()) == [f"camera/{number}" for number in range(min(cameras, COUNT))]
+def test_a_camera_that_is_calibrated_is_watched_from_then_on(cell):
+    """However many there are; a silhouette of one that is not calibrated counts for nothing."""
+    cell.give(COUNT)
+    assert len(cell.tick(0, 1, 2)) == COUNT
+    camera = Calibration(np.eye(3), np.zeros(5), np.eye(4), WIDTH, HEIGHT)
+    cell.online.init(camera_entity(COUNT), CALIBRATION, camera)
+    assert list(cell.tick()) == [f"camera/{number}" for number in range(COUNT + 1)]
 
 
 def test_buffers_that_alternate_are_stuck(cell):
