@@ -95,14 +95,15 @@ def test_samples_lie_on_the_surface_and_are_spread_by_area():
     """A large triangle gets as many more samples as it is larger; each call gives the same ones."""
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [3, 0, 0], [0, 3, 1.0]])
     mesh = Mesh(vertices, np.array([[0, 1, 2], [0, 3, 4]]))
-    points = samples_on(mesh, 9000)
+    points, triangle = samples_on(mesh, 9000)
     on_first = (points[:, 2] == 0.0) & (points[:, :2].sum(1) <= 1.0 + 1e-9)
+    np.testing.assert_array_equal(triangle, np.where(on_first, 0, 1))
     ratio = 3.0 * np.sqrt(10.0)  # of the two areas
     assert on_first.sum() == pytest.approx(9000 / (1.0 + ratio), rel=0.02)
     rest = points[~on_first]
     np.testing.assert_allclose(rest[:, 2], rest[:, 1] / 3.0, atol=1e-12)
     assert (rest[:, 0] / 3.0 + rest[:, 1] / 3.0 <= 1.0 + 1e-9).all()
-    np.testing.assert_array_equal(points, samples_on(mesh, 9000))
+    np.testing.assert_array_equal(points, samples_on(mesh, 9000)[0])
 
 
 @settings(max_examples=15, deadline=None)

@@ -113,7 +113,7 @@ def _decoded(
             read = o3d.io.read_triangle_mesh(path)
             vertices_m, triangles = np.asarray(read.vertices), np.asarray(read.triangles)
             if triangles.size and triangles.min() >= 0 and triangles.max() < len(vertices_m):
-                return samples_on(Mesh(vertices_m, triangles), MESH_SAMPLES), None, True
+                return samples_on(Mesh(vertices_m, triangles), MESH_SAMPLES)[0], None, True
         cloud = o3d.io.read_point_cloud(path)
     colours = None
     if cloud.has_colors():

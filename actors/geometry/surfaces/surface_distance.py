@@ -116,7 +116,7 @@ def _equal(left: npt.NDArray[Any], right: npt.NDArray[Any]) -> bool:
 
 def _towards(here: Mesh, there: Mesh, share: float) -> tuple[float, float, Points]:
     """Return share, largest distance and farthest point from one surface to another."""
-    samples = samples_on(here)
+    samples, _ = samples_on(here)
     corners = np.asarray(here.vertices_m, float)[np.unique(here.triangles)]
     points = np.concatenate([samples, corners])
     scene = ray_scene(there.vertices_m, there.triangles)
@@ -139,8 +139,11 @@ def _worse(one_way: tuple[float, float, Points], other_way: tuple[float, float, 
     return Apart(max(one_way[0], other_way[0]), largest_m, (x, y, z), of_left)
 
 
-def samples_on(mesh: Mesh, count: int = SAMPLES) -> Points:
-    """Return points spread over a surface by area, (`count`, 3), the same at each call."""
+def samples_on(mesh: Mesh, count: int = SAMPLES) -> tuple[Points, npt.NDArray[np.int64]]:
+    """Return points spread over a surface by area, (`count`, 3), the same at each call.
+
+    Also the number of the triangle that each lies in.
+    """
     corners = np.asarray(mesh.vertices_m, float)[mesh.triangles]
     one, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     area = np.linalg.norm(np.cross(one, other), axis=1)
@@ -155,4 +158,4 @@ def samples_on(mesh: Mesh, count: int = SAMPLES) -> Points:
     points: Points = (
         corners[chosen, 0] + along[:, None] * one[chosen] + across[:, None] * other[chosen]
     )
-    return points
+    return points, chosen

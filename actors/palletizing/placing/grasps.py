@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from actors.geometry.surfaces.surface_distance import Mesh, samples_on
 from actors.palletizing.placing.finger_room import FLAT_M2, LINE_N, Grasp, Gripper
 
 if TYPE_CHECKING:
@@ -91,16 +92,10 @@ def centre_of(surface: Surface) -> F64:
 
 def _sampled(surface: Surface) -> tuple[F64, F64, float]:
     """Return points evenly over the surface, their outward normals, and the area of each."""
-    random = np.random.default_rng(0)
-    corners = surface.vertices_m.astype(np.float64)
-    a, b, c = (corners[surface.triangles[:, i]] for i in range(3))
+    points, chosen = samples_on(Mesh(surface.vertices_m, surface.triangles), SAMPLES)
+    a, b, c = surface.vertices_m.astype(np.float64)[surface.triangles].transpose(1, 0, 2)
     normals = np.cross(b - a, c - a)
     doubled = np.linalg.norm(normals, axis=1)
-    chosen = random.choice(len(a), SAMPLES, p=doubled / doubled.sum())
-    one, other = random.random((2, SAMPLES, 1))
-    beyond = one + other > 1.0
-    one, other = np.where(beyond, 1.0 - one, one), np.where(beyond, 1.0 - other, other)
-    points = a[chosen] + one * (b - a)[chosen] + other * (c - a)[chosen]
     return points, normals[chosen] / doubled[chosen, None], float(doubled.sum() / 2.0 / SAMPLES)
 
 
