@@ -58,9 +58,8 @@ class Planning(Actor):
     standing = WriteEach(training, PLACES, STANDING)
 
     def __init__(self, packages: int, products: str, views: int = 14) -> None:
-        self.packages, self.products, self.views = packages, products.split(), views
-        if packages < 1 or views < 3 or not self.products:
-            raise ValueError("planning needs a package, a product and three views at least")
+        self.packages, self.views = packages, views
+        self.products = announced(packages, products, views)
 
     def update(self, lock: Lock) -> None:
         """Write the whole plan; the same plan again changes nothing that matters."""
@@ -69,7 +68,7 @@ class Planning(Actor):
         for stop in range(self.packages):
             place, product = place_entity(stop), self.products[stop % len(self.products)]
             lock[self.plans][place] = Plan(product, tray_of(stop), planned_pose(stop))
-            lock[self.standing][place] = Standing(product, "ok", shift_mm=0.0, turn_deg=0.0)
+            lock[self.standing][place] = Standing(product, "ok", 0.0, 0.0)
 
 
 class RowPlanning(Actor):
@@ -100,9 +99,8 @@ class RowPlanning(Actor):
     triggers = (empty, surfaces, results)  # the tray is seen empty when training begins
 
     def __init__(self, packages: int, products: str, frames: str, views: int = 14) -> None:
-        self.packages, self.products, self.views = packages, products.split(), views
-        if packages < 1 or views < 3 or not self.products:
-            raise ValueError("planning needs a package, a product and three views at least")
+        self.packages, self.views = packages, views
+        self.products = announced(packages, products, views)
         self.cell_frames = open_controller(frames)
 
     def update(self, lock: Lock) -> None:
@@ -120,19 +118,27 @@ class RowPlanning(Actor):
             return
         empty = left_out(self.packages, results, before)
         if before is None or empty != before.left_out:
-            products = {
-                number: self.products[number % len(self.products)]
-                for number in range(self.packages)
-                if number not in empty
-            }
+            come = (number for number in range(self.packages) if number not in empty)
+            products = {number: self.products[number % len(self.products)] for number in come}
             request, plans = lock.get(self.request), lock[self.plans]
             fixed = set(results) if request is None else {*results, request.place}
             for place, plan in plans_of(products, lock[self.surfaces]).items():
                 if place.name not in fixed or place not in plans:
                     plans[place] = plan
-                    standing = Standing(plan.product, "ok", shift_mm=0.0, turn_deg=0.0)
-                    lock[self.standing][place] = standing
+                    lock[self.standing][place] = Standing(plan.product, "ok", 0.0, 0.0)
         lock[self.planned] = Planned(results_of(results), empty)
+
+
+def announced(packages: int, products: str, views: int) -> list[str]:
+    """Return the names of the products that will come.
+
+    Raises:
+        ValueError: There is nothing to plan, or too few views of it.
+    """
+    names = products.split()
+    if packages < 1 or views < 3 or not names:
+        raise ValueError("planning needs a package, a product and three views at least")
+    return names
 
 
 def left_out(

@@ -125,9 +125,9 @@ class Setup(Actor):
         lock[self.grid] = grid_of(self.voxel_m)
         lock[self.model] = ARM
         lock[self.task] = task_of()
-        now_ns = time.time_ns()
-        begin_ns = NEVER_NS
+        now_ns, begin_ns = time.time_ns(), NEVER_NS
         if self.confirm > 0.0:
+            # At a tick, so that the images show the scenario's seconds 0, 0.1, 0.2 …
             begin_ns = -(-(now_ns + round(self.confirm * 1e9)) // PERIOD_NS) * PERIOD_NS
             lock[self.empty] = now_ns
         lock[self.playing] = Playing(
