@@ -39,6 +39,11 @@ log = logging.getLogger("enact.actor")
 
 OPEN_S: Final = 60.0
 """How long a source may take to open; a simulated one draws its room and compiles its loops."""
+WAITS: Final = (
+    "%s waits for its calibration: the context has none yet; the actor Setup writes it, or"
+    " `lock.put` from a program of your own"
+)
+"""Said once: cameras start before what calibrates them."""
 PREPARE_AFTER_NS: Final = 78_000_000
 """So long after a tick its images have become a hull, and the next ones are prepared."""
 
@@ -57,9 +62,28 @@ class Capture:
             queue.SimpleQueue()
         )
         self._hangs: Future[Any] | None = None
+        self._opened: Calibration | None = None
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"capture-{name}", daemon=True)
         self._thread.start()
+
+    def image(self, calibration: Calibration, stamp_ns: int) -> tuple[Image, int]:
+        """Return the image of a tick, see `frame`, of a source that is open for a calibration.
+
+        It is opened anew for another calibration, and after an error.
+
+        Raises:
+            CameraError: It cannot be opened, or no image came, or one of them not in time.
+        """
+        if self._opened is None or not _same(self._opened, calibration):
+            self.open(calibration)
+            self._opened = calibration
+        try:
+            return self.frame(stamp_ns)
+        except CameraError as error:
+            if not isinstance(error, CameraEndedError):
+                self._opened = None
+            raise
 
     def open(self, calibration: Calibration) -> None:
         """Open the source for a calibration.
@@ -161,7 +185,6 @@ class Camera(Actor):
     def __init__(self, source: str = "v4l2:/dev/video{camera}") -> None:
         self.source = source
         self._capture: Capture | None = None
-        self._opened: Calibration | None = None
         self._waits = False
 
     def start(self) -> None:
@@ -193,33 +216,16 @@ class Camera(Actor):
         assert self._capture is not None
         calibration = lock.get(self.calibration)
         if calibration is None:
-            self._wait_for_calibration()
+            if not self._waits:
+                log.info(WAITS, self.only_entity_name())
+            self._waits = True
             return
         self._waits = False
         self.look(lock)
-        if self._opened is None or not _same(self._opened, calibration):
-            self._capture.open(calibration)
-            self._opened = calibration
-        try:
-            image, exposed_ns = self._capture.frame(lock.tick_ns)
-        except CameraEndedError:
-            raise
-        except CameraError:
-            self._opened = None
-            raise
+        image, exposed_ns = self._capture.image(calibration, lock.tick_ns)
         lock.put(self.image, image, stamp_ns=exposed_ns)
         self.taken(lock, image, exposed_ns)
         self._capture.prepare(lock.tick_ns + PERIOD_NS)
-
-    def _wait_for_calibration(self) -> None:
-        """Say once that no image can be taken yet: cameras start before what calibrates them."""
-        if not self._waits:
-            log.info(
-                "%s waits for its calibration: the context has none yet; the actor Setup writes"
-                " it, or `lock.put` from a program of your own",
-                self.only_entity_name(),
-            )
-        self._waits = True
 
     def taken(self, lock: Lock, image: Image, exposed_ns: int) -> None:
         """Do with an image what belongs to its update; a camera that only publishes does nothing.

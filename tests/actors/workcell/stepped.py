@@ -84,14 +84,13 @@ class Inline:
     """What `Camera` asks for images, without a thread, and without getting ready in good time."""
 
     def __init__(self, source: CameraSource) -> None:
-        self._source = source
+        self._source, self._open = source, False
 
-    def open(self, calibration: Calibration) -> None:
-        """Open the source."""
-        self._source.open(calibration)
-
-    def frame(self, stamp_ns: int) -> tuple[Any, int]:
+    def image(self, calibration: Calibration, stamp_ns: int) -> tuple[Any, int]:
         """Return the image of a tick, exposed at it."""
+        if not self._open:
+            self._source.open(calibration)
+        self._open = True
         return self._source.frame(stamp_ns), stamp_ns
 
     def prepare(self, stamp_ns: int) -> None:

@@ -243,6 +243,9 @@ def test_camera_that_fails_writes_nothing_and_opens_its_source_again():
         online = cell.world("online")
         online.init(camera_entity(0), CALIBRATION, CALIBRATION_OF)
         camera, seen = camera_of(device), View(online, camera_entity(0), IMAGE)
+        camera.start()
+        stop, camera.stop = camera.stop, lambda: None  # it goes on from run to run
+        camera.start = camera.stop
         device.fails = CameraError("camera/0: the device gave none")
         with pytest.raises(CameraError, match="the device gave none"):
             testing.run_once(camera, cell)
@@ -254,3 +257,4 @@ def test_camera_that_fails_writes_nothing_and_opens_its_source_again():
         with pytest.raises(CameraEndedError):
             testing.run_once(camera, cell)
         assert device.opened == 2
+        stop()
