@@ -38,8 +38,7 @@ class Gripper(Actor):
         self.controller, self.force_limit_n, self.every_s = controller, force_limit_n, every_s
         self._gripper: GripperController | None = None
         self._started = False
-        self._number: int | None = None
-        self._refused: int | None = None
+        self._number = self._refused = 0
 
     def start(self) -> None:
         """Make the connection ready; it is opened by the first update."""
@@ -56,7 +55,7 @@ class Gripper(Actor):
         assert gripper is not None
         if not self._started:
             gripper.start()
-            self._started, self._number, self._refused = True, None, None
+            self._started, self._number, self._refused = True, 0, 0
         command = lock.get(self.command)
         try:
             if command is not None and command.number not in (self._number, self._refused):
@@ -67,7 +66,7 @@ class Gripper(Actor):
             self._started = False
             raise
         lock[self.state] = GripState(
-            number=0 if self._number is None else self._number,
+            number=self._number,
             width_m=now.width_m,
             width_rate_m_s=now.width_rate_m_s,
             force_n=now.force_n,

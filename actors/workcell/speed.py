@@ -92,7 +92,15 @@ def judged(
         states_age_s: Age of the cameras' states at the exposure; infinite if there are none.
         misfits: Cameras whose background no longer fits.
         without_path: Why there is no path; empty if there is one.
+
+    Raises:
+        ValueError: The distance counts on more braking than the arm has.
     """
+    if separation.braking_m_s2 > BRAKING_M_S2:
+        raise ValueError(
+            f"braking_m_s2 is {separation.braking_m_s2:g}; the arm's loop brakes with"
+            f" {BRAKING_M_S2:g} m/s², and no distance may count on more"
+        )
     if misfits > MISFITS_MAX:
         cause = f"the {MISFIT}"
         return Verdict("fault", 0.0, cause, f"{cause} in {misfits} cameras")
@@ -169,32 +177,22 @@ class SpeedControl(Actor):
         return time.time_ns()
 
     def update(self, lock: Lock) -> None:
-        """Judge the newest hull.
-
-        Raises:
-            ValueError: `braking_m_s2` is more than the arm brakes with.
-        """
-        if self.braking_m_s2 > BRAKING_M_S2:
-            raise ValueError(
-                f"braking_m_s2 is {self.braking_m_s2:g}; the arm's loop brakes with"
-                f" {BRAKING_M_S2:g} m/s², and no distance may count on more"
-            )
+        """Judge the newest hull."""
         hull, captured_ns = lock[self.hull], lock.stamp_ns(self.hull)
         joints, path, model = lock.get(self.joints), lock.get(self.path), lock.get(self.model)
-        age_s = (self.now_ns() - captured_ns) / 1e9
-        reaction = self._reaction
+        age_s, reaction = (self.now_ns() - captured_ns) / 1e9, self._reaction
         reaction.latest_s = self.latest_s
         reaction.seen(captured_ns, age_s)
         joints_ns = int(joints.stamp_ns[-1]) if joints is not None else 0
         states_ns = -math.inf if lock.is_null(self.cameras) else lock.stamp_ns(self.cameras)
         misfits, without = troubles_of(lock.get(self.cameras, {}))
-        to_sides_m = math.inf
+        nearest_m = hull.nearest_m
         if self.open_sides:
-            to_sides_m = distance_to_sides_m(lock.get(self.grid), model, joints)
+            nearest_m = min(nearest_m, distance_to_sides_m(lock.get(self.grid), model, joints))
         nominal_m_s = self._nominal_m_s(model, path, joints)
         human_m_s, by_whom = self.people_m_s(lock)
         verdict = judged(
-            nearest_m=min(hull.nearest_m, to_sides_m),
+            nearest_m=nearest_m,
             age_s=age_s,
             joints_age_s=max(0.0, (captured_ns - joints_ns) / 1e9),
             nominal_m_s=nominal_m_s,
