@@ -12,6 +12,9 @@ What a run promises to `update(self, lock)`:
   after its lock was lost (`hold_s` has passed, or the shard was away for long), and after a commit
   whose answer was lost.  So an update computes its results from its inputs; it neither counts calls
   nor moves anything.  An actor that moves something sets `once = True`.
+- Attributes that it sets stay set if its commit then fails.  What must not be ahead of the data is
+  an aspect, or is kept with the stamp of its input, or with the version that its output then has
+  (`lock.version(output) + 1`), and counts when the next update sees that one.
 
 Departure from ENACT 3.1: the paper's actor owns a fixed set of entities E_a; here E_a is a name
 pattern, because its own 4.2 meets new entities at run time.

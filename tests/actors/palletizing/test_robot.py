@@ -378,7 +378,8 @@ def test_execution_is_published_until_it_stands(trial, monkeypatch):
     """The commit fails: the loop has no newer state, and this one is written all the same."""
     joints = trial.actors()[0]
     joints.start()
-    monkeypatch.setattr(joints, "start", lambda: None)
+    for method in ("start", "stop"):
+        monkeypatch.setattr(joints, method, lambda: None)
     robot._loops[trial.address].execution = execution(1, "")
     lose_commit(joints, trial.cell)
     testing.run_once(joints, trial.cell)

@@ -13,6 +13,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from lost_commits import lose_commit
 
 from actors.geometry.hull.visibility import camera_table
 from actors.workcell import reconstruction, robot, setup
@@ -124,6 +125,9 @@ class Stepped:
         seed: Its seed.
         seconds: How long it lasts.
         begin_s: At which second of it to begin.
+
+    Attributes:
+        loses: The commit of each first step of an actor with triggers fails.
     """
 
     def __init__(
@@ -140,6 +144,7 @@ class Stepped:
         self.scenario = scenario_of(name, seed, seconds)
         self.config = {one.name: one for one in load_config(TEMPLATE).actors}
         self.actors: dict[str, Actor] = {}
+        self.loses = False
         self.frozen: set[str] = set()
         self.versions: dict[tuple[str, str, str], list[Kept[Any]]] = {}
         self._newest: dict[tuple[str, str, str], int] = {}
@@ -183,6 +188,8 @@ class Stepped:
         for name, actor in list(self.actors.items()):
             if name not in self.frozen and name.startswith(names):
                 worlds = dict(self.config[name].worlds) or None
+                if self.loses and actor.declaration.triggers:
+                    lose_commit(actor, self.cell, worlds)
                 updates += testing.run_once(actor, self.cell, worlds)
         return updates
 

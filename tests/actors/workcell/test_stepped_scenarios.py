@@ -7,6 +7,7 @@ is in `test_demo_faults`.
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import pytest
@@ -17,13 +18,16 @@ from actors.workcell.demo.report import stop_checks
 from actors.workcell.planning import PathPlanning
 from actors.workcell.scores.evaluation import score
 from actors.workcell.scores.scenario_checks import checks_of
+from actors.workcell.scores.trace import ASPECTS, ONLINE
 from enact_dist import Lock, View, Write, testing
 from enact_dist.access.reads import slot_of
+from enact_dist.wire.payload import encode_datum
 
 from . import stepped as stepping
 from .stepped import stepped
 
 if TYPE_CHECKING:
+    from enact_dist.core.protocol.datum import Datum
     from enact_dist.world.context import WorldContext
 
     from .stepped import Stepped
@@ -137,6 +141,35 @@ def test_online_never_sees_what_the_planner_of_a_fork_does(monkeypatch: pytest.M
         assert seen[-1] > begun  # it did plan
         view = View(fork, words.ROBOT, words.PATH)
         assert len(fork.view(view)[view].waypoints) > 1
+
+
+def test_nothing_tells_that_commits_have_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """S3: each step of an actor with triggers is done twice; all data are those of one that stood."""
+    written = []
+    for loses in (False, True):
+        with stepped(monkeypatch, "S3", seed=SEED, seconds=20.0, begin_s=1.2) as cell:
+            cell.actors["planning"].limit_s = 3600.0  # type: ignore[attr-defined]
+            cell.loses = loses
+            cell.until(3.0)
+            written.append(_all_written(cell))
+
+    assert (ONLINE, "human/0", "track") in written[0]
+    assert [slot for slot, data in written[0].items() if written[1].get(slot) != data] == []
+
+
+def _all_written(cell: Stepped) -> dict[tuple[str, str, str], list[Datum]]:
+    """Return all data by slot, without how long it took to plan them."""
+    kept = {
+        slot: [(one.stamp_ns, one.datum) for one in all_] for slot, all_ in cell.versions.items()
+    }
+    path = ONLINE, words.ROBOT.name, words.PATH.name
+    kept[path] = [(stamp_ns, replace(one, took_ms=0.0)) for stamp_ns, one in kept[path]]
+    return {
+        slot: [
+            encode_datum(one, ASPECTS[slot[2]].datum_type, stamp_ns=at_ns) for at_ns, one in all_
+        ]
+        for slot, all_ in kept.items()
+    }
 
 
 def _newest_path(world: WorldContext) -> int:
