@@ -10,7 +10,8 @@
  * and begin from what its session keeps there.  A lock over both shards asks each of them in its
  * turn, whatever its session keeps, and leaves nothing kept.  What is kept and not in use ends in
  * the step in which a lock enters the queue for it, also a lock of the same session; what is in use
- * ends with its use.  Two threads of two sessions; with THREADS=3 the first two are of one session.
+ * ends with its use.  With FAR, what is not in use ends when its session has heard that a lock waits,
+ * whatever its threads wait for.  Two threads of two sessions; with THREADS=3 the first two are of one session.
  */
 #ifndef THREADS
 #define THREADS 2
@@ -39,6 +40,9 @@ byte has[THREADS];              /* granted to this lock, or in use by it */
 
 byte owner[2] = NONE;           /* the session that has the grant */
 bool kept[2];
+#ifdef FAR
+bool word[2];                   /* to the owner: another lock waits */
+#endif
 
 byte rule;
 #define BROKEN(n) rule = n; assert(rule != n)
@@ -66,6 +70,11 @@ byte rule;
 #define revokes(c, s) (owner[s] != of(c))
 #else
 #define revokes(c, s) true
+#endif
+#ifdef HEARS_BETWEEN_LOCKS      /* the thread itself listens, once it has no lock and awaits none */
+#define hears(s) (phase[owner[s]] == REST)
+#else
+#define hears(s) true
 #endif
 
 inline begin(c, what) { phase[c] = WANTS; need[c] = what; locks[c]++; has[c] = early(c, 0) | early(c, 1) }
@@ -96,7 +105,11 @@ proctype Thread(byte c) {
        if
        :: idle(shard(c)) && revokes(c, shard(c)) ->
           if :: owner[shard(c)] == of(c) -> REACHED(2) :: else -> REACHED(4) fi;
+#ifdef FAR
+          word[shard(c)] = true
+#else
           owner[shard(c)] = NONE; kept[shard(c)] = false
+#endif
        :: else
        fi }
   :: atomic { phase[c] == WANTS && at[c] == 2 -> phase[c] = IN; if :: need[c] == 3 -> REACHED(3) :: else fi }
@@ -109,6 +122,9 @@ proctype Thread(byte c) {
 proctype Shard(byte s) {
   byte c;
   end: do
+#ifdef FAR
+  :: atomic { word[s] && idle(s) && hears(s) -> owner[s] = NONE; kept[s] = false; REACHED(6) }
+#endif
   :: atomic { owner[s] == NONE && (asks[0] & BIT(s)) -> c = 0; goto grant }
   :: atomic { owner[s] == NONE && (asks[1] & BIT(s)) -> c = 1; goto grant }
 #if THREADS == 3
@@ -116,7 +132,11 @@ proctype Shard(byte s) {
 #endif
   od;
   grant:
-    atomic { owner[s] = of(c); asks[c] = asks[c] & ~BIT(s); has[c] = has[c] | BIT(s); c = 0 };
+    atomic {
+#ifdef FAR
+      word[s] = false;
+#endif
+      owner[s] = of(c); asks[c] = asks[c] & ~BIT(s); has[c] = has[c] | BIT(s); c = 0 };
     goto end
 }
 

@@ -100,6 +100,16 @@ class Result:
         return self.rule == wanted[variant.expects]
 
 
+def _wrong_and_reached(
+    model: str,
+    mutants: list[tuple[str, tuple[str, ...], int, str]],
+    goals: list[tuple[int, tuple[str, ...], str]],
+) -> list[Variant]:
+    """Return the wrong edits and places of a model, each with the size in which it is found."""
+    breaks = [Variant(model, text, BREAKS, (m, *size), rule) for m, size, rule, text in mutants]
+    return breaks + [Variant(model, t, REACHES, (f"GOAL={n}", *size), n) for n, size, t in goals]
+
+
 def _commits() -> list[Variant]:
     model, one = "commit_over_shards", ("CLIENTS=1", "LOCKS=2", "KINDS=4")
     mutants = [
@@ -118,6 +128,8 @@ def _commits() -> list[Variant]:
         ("FORGETS_PREPARED", 3, "a restarted participant has lost what it has prepared"),
         ("RESTORES_NO_LOCK", 10, "a restarted participant has what it prepared, not its lock"),
     ]
+    late_mutants = [("FINISHED_EARLY", one, 9, "Finished is said before the end is durable")]
+    late_goals = [(5, one, "a late resolve after all is finished and forgotten")]
     goals = [
         (1, "a read is validated"),
         (2, "a client is told that it has committed"),
@@ -132,21 +144,8 @@ def _commits() -> list[Variant]:
         Variant(model, "2 clients, 1 lock each, 1 restart of each shard", HOLDS),
         Variant(model, "1 client, 2 locks, 1 restart of each shard", HOLDS, one),
         *(Variant(model, text, BREAKS, (macro,), rule) for macro, rule, text in mutants),
-        Variant(
-            model,
-            "Finished is said before the end is durable",
-            BREAKS,
-            ("FINISHED_EARLY", *one),
-            9,
-        ),
         *(Variant(model, text, REACHES, (f"GOAL={goal}",), goal) for goal, text in goals),
-        Variant(
-            model,
-            "a late resolve after all is finished and forgotten",
-            REACHES,
-            ("GOAL=5", *one),
-            5,
-        ),
+        *_wrong_and_reached(model, late_mutants, late_goals),
     ]
 
 
@@ -161,17 +160,16 @@ def _grace() -> list[Variant]:
         ("WELCOMES_EARLY", "a session acts before its record is durable"),
     ]
     goals = [
-        (1, "the grace ends early: all have acknowledged"),
-        (2, "a lock is held in the second epoch"),
-        (3, "a grant of an epoch that is over is refused"),
-        (4, "a goodbye ends the grace"),
-        (5, "a keep-alive renews a belief that was over"),
-        (6, "the grace ends by time"),
+        (1, (), "the grace ends early: all have acknowledged"),
+        (2, (), "a lock is held in the second epoch"),
+        (3, (), "a grant of an epoch that is over is refused"),
+        (4, (), "a goodbye ends the grace"),
+        (5, (), "a keep-alive renews a belief that was over"),
+        (6, (), "the grace ends by time"),
     ]
     return [
         Variant(model, "2 clients, 1 restart, any number of locks", HOLDS),
-        *(Variant(model, text, BREAKS, (macro,), 7) for macro, text in mutants),
-        *(Variant(model, text, REACHES, (f"GOAL={goal}",), goal) for goal, text in goals),
+        *_wrong_and_reached(model, [(macro, (), 7, t) for macro, t in mutants], goals),
     ]
 
 
@@ -203,11 +201,7 @@ def _cuts() -> list[Variant]:
         Variant(model, "2 commits, stamps up to 6, views elsewhere too", HOLDS, steady),
         Variant(model, "1 commit, stamps up to 4, 1 restart", HOLDS, restart),
         Variant(model, "the same, seen by an observer", HOLDS, observer),
-        *(Variant(model, text, BREAKS, (macro, *size), 18) for macro, size, text in mutants),
-        *(
-            Variant(model, text, REACHES, (f"GOAL={goal}", *size), goal)
-            for goal, size, text in goals
-        ),
+        *_wrong_and_reached(model, [(m, size, 18, text) for m, size, text in mutants], goals),
     ]
 
 
@@ -229,11 +223,7 @@ def _expected_views() -> list[Variant]:
     return [
         Variant(model, "2 shards, 2 clients, 2 locks each", HOLDS),
         Variant(model, "1 shard, 2 clients, 2 locks each", HOLDS, one),
-        *(Variant(model, text, BREAKS, (macro, *size), 6) for macro, size, text in mutants),
-        *(
-            Variant(model, text, REACHES, (f"GOAL={goal}", *size), goal)
-            for goal, size, text in goals
-        ),
+        *_wrong_and_reached(model, [(m, size, 6, text) for m, size, text in mutants], goals),
     ]
 
 
@@ -282,37 +272,79 @@ def _kept_grants() -> list[Variant]:
         Variant(model, "2 locks each; no lease ends, no Release comes", HOLDS, silent),
         Variant(model, "2 locks and 1, deaths, 1 restart", HOLDS, restart),
         Variant(model, "1 session, 2 threads, 2 locks and 1, 1 restart", HOLDS, (*one, *restart)),
-        *(
-            Variant(model, text, BREAKS, (macro, *size), rule)
-            for macro, size, rule, text in mutants
-        ),
-        *(
-            Variant(model, text, REACHES, (f"GOAL={goal}", *size), goal)
-            for goal, size, text in goals
-        ),
+        *_wrong_and_reached(model, mutants, goals),
+    ]
+
+
+def _kept_far() -> list[Variant]:
+    model = "kept_far"
+    living, restart, one = ("NO_DEATH",), ("EPOCHS=2",), ("ONE_SESSION",)
+    steady = ("STEADY", *living)
+    more, writes = ("LOCKS0=3", "LOCKS1=2", *steady), ("WRITES_ALONE", *steady)
+    mutants = [
+        ("RELEASES_IN_USE", writes, 7, "word of a recall ends the grant under its block"),
+        ("REVOKES_AT_ONCE", writes, 7, "the shard does not wait for the client"),
+        ("RELEASES_AND_KEEPS", writes, 7, "a grant is given back, and its entry stays"),
+        ("ENDING_IS_NO_USE", writes, 7, "word between a commit and its answer finds no use"),
+        ("LATE_READS", writes, 7, "a late Validate ends a kept grant that is in use"),
+        ("KEEP_ALIVE_ENDS_KEPT", writes, 7, "a keep-alive frees a grant whose first lock is over"),
+        ("SUPERSEDES_KEPT", (*one, *steady), 7, "so does a newer lock of the thread"),
+        ("BELIEVES_FOREVER", living, 6, "blocks begin and end alone though the lease is over"),
+        ("KEEPS_OVER_EPOCH", (*restart, *steady), 6, "an epoch is acknowledged, the entry stays"),
+        ("NO_SEQ_CHECK", steady, 2, "any seq commits under a kept grant"),
+        ("KEEPS_AFTER_UNKNOWN", steady, 2, "the entry stays after a commit without an answer"),
+        ("SHOWS_OLD", steady, 2, "its own commit does not change the entry"),
+        ("IN_FLIGHT_ENDS", steady, 2, "a grant whose commit the store works on is given back"),
+        ("PUTS_BACK_RECALLED", steady, 13, "what was heard in a block is forgotten with it"),
+        ("KEEPS_WITH_WAITER", steady, 12, "a grant is kept though another lock waits"),
+        ("TELLS_ONCE", steady, 12, "word of a recall that is lost is not repeated"),
+        ("IGNORES_UNKNOWN", steady, 12, "word of a grant that nobody remembers is ignored"),
+    ]
+    goals = [
+        (1, steady, "a block ends whose grant was recalled meanwhile"),
+        (2, steady, "a block that only reads ends without a message"),
+        (3, steady, "word comes in a block"),
+        (4, steady, "word comes between two blocks"),
+        (5, steady, "word comes of a grant that its client has forgotten"),
+        (6, steady, "a late commit under a kept grant that its client has forgotten"),
+        (7, (*restart, *steady), "a restart beside a kept grant"),
+        (8, steady, "a recalled grant is given back"),
+        (9, living, "a lease ends whose grant was recalled"),
+    ]
+    return [
+        Variant(model, "2 sessions, 2 locks each", HOLDS, ("LOCKS1=2", *living)),
+        Variant(model, "3 locks and 2; no lease ends", HOLDS, more),
+        Variant(model, "2 locks and 1, deaths, 1 restart", HOLDS, restart),
+        Variant(model, "1 session, 2 threads, 2 locks and 1, 1 restart", HOLDS, (*one, *restart)),
+        *_wrong_and_reached(model, mutants, goals),
     ]
 
 
 def _kept_order() -> list[Variant]:
-    model, three = "kept_order", ("THREADS=3", "LOCKS=2")
+    model, three, far = "kept_order", ("THREADS=3", "LOCKS=2"), ("FAR",)
     mutants = [
-        ("NEVER_REVOKES", "a kept grant ends with its next use only"),
-        ("OWN_NOT_REVOKED", "a kept grant does not end for a lock of the same session"),
-        ("TAKES_EARLY", "a lock over two shards takes what is kept at once, out of turn"),
-        ("NO_ORDER", "one client begins with the other shard"),
+        ("NEVER_REVOKES", (), 12, "a kept grant ends with its next use only"),
+        ("OWN_NOT_REVOKED", (), 12, "a kept grant does not end for a lock of the same session"),
+        ("TAKES_EARLY", (), 12, "a lock over two shards takes what is kept at once, out of turn"),
+        ("NO_ORDER", (), 12, "one client begins with the other shard"),
+        ("HEARS_BETWEEN_LOCKS", far, 12, "word of a recall is heard between two locks only"),
     ]
     goals = [
-        (1, "a lock begins from what is kept"),
-        (2, "a lock over two shards ends what its own session keeps"),
-        (3, "a lock over two shards is granted"),
-        (4, "a lock ends what another session keeps"),
-        (5, "what is kept ends with its use"),
+        (1, (), "a lock begins from what is kept"),
+        (2, (), "a lock over two shards ends what its own session keeps"),
+        (3, (), "a lock over two shards is granted"),
+        (4, (), "a lock ends what another session keeps"),
+        (5, (), "what is kept ends with its use"),
+        (6, far, "word of a recall ends what is kept"),
     ]
     return [
         Variant(model, "2 sessions, 2 shards, 4 locks each", HOLDS, ("LOCKS=4",)),
         Variant(model, "the same, one of them with 2 threads, 2 locks each", HOLDS, three),
-        *(Variant(model, text, BREAKS, (macro,), 12) for macro, text in mutants),
-        *(Variant(model, text, REACHES, (f"GOAL={goal}",), goal) for goal, text in goals),
+        Variant(model, "no common memory, 4 locks each", HOLDS, ("FAR", "LOCKS=4")),
+        Variant(
+            model, "the same, one of them with 2 threads, 2 locks each", HOLDS, ("FAR", *three)
+        ),
+        *_wrong_and_reached(model, mutants, goals),
     ]
 
 
@@ -385,14 +417,7 @@ def _takeover() -> list[Variant]:
         Variant(model, "2 clients, any number of locks, no batch", HOLDS, locks),
         Variant(model, "2 clients and 1 batch, fewer renewals", HOLDS, ("BEATS=1", "LATE=0")),
         Variant(model, "2 faults, then the shard is served", HOLDS, all_well),
-        *(
-            Variant(model, text, BREAKS, (macro, *size), rule)
-            for macro, size, rule, text in mutants
-        ),
-        *(
-            Variant(model, text, REACHES, (f"GOAL={goal}", *size), goal)
-            for goal, size, text in goals
-        ),
+        *_wrong_and_reached(model, mutants, goals),
     ]
 
 
@@ -402,6 +427,7 @@ VARIANTS = (
     *_cuts(),
     *_expected_views(),
     *_kept_grants(),
+    *_kept_far(),
     *_kept_order(),
     *_standing_locks(),
     *_takeover(),
