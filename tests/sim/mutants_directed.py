@@ -22,6 +22,7 @@ from enact_dist.core.state.grants import Tenures
 from enact_dist.core.state.retention import SlotHistory
 from enact_dist.core.state.sessions import SessionState, SessionTable
 from enact_dist.core.state.slots import SlotMap
+from enact_dist.core.state.tenure import KeptGrants
 from enact_dist.terms import Durability
 
 if TYPE_CHECKING:
@@ -150,6 +151,17 @@ def forgets_a_later_commit_of_its_own(patch: Patch) -> None:
     patch(Unsettled, "committed", wrong)
 
 
+def far_hold_limits_count_from_the_recall(patch: Patch) -> None:
+    """A shard does not wait for blocks that begin before their client hears of a recall."""
+    recall = KeptGrants.recall
+
+    def wrong(kept: KeptGrants, tenure: Any, *, now_ns: int) -> None:
+        tenure.unheard_ns = 0
+        recall(kept, tenure, now_ns=now_ns)
+
+    patch(KeptGrants, "recall", wrong)
+
+
 DIRECTED = {
     takes_grants_of_an_old_epoch: "test_grant_of_an_epoch_that_is_over_is_not_taken",
     leases_end_late: "test_lease_ends_exactly_with_its_ttl",
@@ -169,5 +181,6 @@ DIRECTED = {
     ),
     keeps_captures_of_what_is_gone: "test_history_agrees_with_a_plain_list",
     views_do_not_renew: "test_everything_that_is_counted_renews",
+    far_hold_limits_count_from_the_recall: "test_hold_limit_is_longer_by_a_lease",
 }
 """Each with the test of `tests/core` that catches it."""

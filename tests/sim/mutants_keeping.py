@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from enact_dist.core.client.client import Client
 from enact_dist.core.client.kept import Keeping, KeptGrant, OwnGrants
 from enact_dist.core.client.plan import Phase
+from enact_dist.core.protocol.messages import FAR
 from enact_dist.core.state.commits import Commits
 from enact_dist.core.state.grants import Tenures
 from enact_dist.core.state.tenure import KeptGrants
@@ -148,3 +149,33 @@ def leaves_cells_set(patch: Patch) -> None:
 def takes_kept_grants_for_work(patch: Patch) -> None:
     """The drafts of a session stay as long as it keeps a grant, used or not."""
     patch(Tenures, "works", lambda tenures, session: session in tenures.by_session)
+
+
+def word_ends_what_a_block_uses(patch: Patch) -> None:
+    """A client that hears of a recall gives a far grant back under its block."""
+    hear = OwnGrants.hear
+    patch(OwnGrants, "hear", lambda kept, shard, left, _used: hear(kept, shard, left, set()))
+
+
+def far_grants_are_revoked(patch: Patch) -> None:
+    """A shard takes far grants back at once, as if it could see whether a block uses them."""
+    recall = KeptGrants.recall
+
+    def wrong(kept: KeptGrants, tenure: Any, *, now_ns: int) -> None:
+        recall(kept, tenure, now_ns=now_ns)
+        if tenure.recalled and tenure.kept == FAR and not tenure.committing:
+            kept._end(tenure)
+
+    patch(KeptGrants, "recall", wrong)
+
+
+def gives_back_and_keeps(patch: Patch) -> None:
+    """A client gives back what it has heard of, and begins further blocks under it."""
+    hear = OwnGrants.hear
+
+    def wrong(kept: OwnGrants, shard: str, left: Any, used: Any) -> None:
+        before = dict(kept.by_items)
+        hear(kept, shard, left, used)
+        kept.by_items.update(before)
+
+    patch(OwnGrants, "hear", wrong)

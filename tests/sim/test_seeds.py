@@ -188,6 +188,8 @@ HAPPENED = (
     "shard: grants_revoked",
     "shard: grants_recalled",
     "locks begun without a call",
+    "locks begun from afar",
+    "words of a recall",
     "locks ended without a call",
     "late commits under a kept grant fenced",
     "steps while a shard looks at marks",

@@ -23,7 +23,7 @@ from queue import Empty, SimpleQueue
 from typing import Final
 
 from enact_dist import Cell, connect
-from enact_dist.core.protocol.messages import ListLocks, ListSessions, Locks, Sessions
+from enact_dist.core.protocol.messages import MERELY_KEPT, ListLocks, ListSessions, Locks, Sessions
 from enact_dist.verify.chaos.journal import SUFFIX, Journal
 from enact_dist.verify.chaos.workload import LockWorkload
 from enact_dist.verify.checker import LockOutcome
@@ -56,7 +56,7 @@ class Watcher:
         self.locks_left = 0
         for shard, answer in zip(shards, answers, strict=True):
             if isinstance(answer, Locks):
-                self.locks_left += sum(holder.kept != "unused" for holder in answer.holders)
+                self.locks_left += sum(holder.kept not in MERELY_KEPT for holder in answer.holders)
                 self._note_doubts(shard, answer, now_ns)
         self._looks += 1
         if self._looks % COUNTERS_EVERY == 0:

@@ -16,6 +16,7 @@ from enact_dist.core.client.client import Client
 from enact_dist.core.client.plan import Phase
 from enact_dist.core.protocol.messages import (
     Acquire,
+    Alive,
     Answer,
     AspectEntry,
     Hello,
@@ -27,6 +28,7 @@ from enact_dist.core.protocol.messages import (
     Welcome,
 )
 from enact_dist.link.client.catalogue import CATALOGUES, KnownCatalogue
+from enact_dist.link.client.kept import QUIET_MAX, QUIET_S, SLICE_NS
 from enact_dist.verify.simulation.hosts.folders import ClientFiles, Folders
 from enact_dist.verify.simulation.hosts.keeping import KeptLocks, Sight, Stop
 from enact_dist.verify.simulation.hosts.world import MS, Host, S
@@ -41,6 +43,7 @@ if TYPE_CHECKING:
     from enact_dist.verify.simulation.hosts.shard_host import ShardPlace
     from enact_dist.verify.simulation.hosts.world import SimulatedWorld
 
+QUIET_NS = int(QUIET_S * S)
 CALL_NS = S
 """How long a call may stay unanswered before its thread takes that for an answer."""
 
@@ -113,6 +116,7 @@ class ClientNode(Host):
         self._late_answers = world.schedule.place(f"{name}-late")
         self._stopped: dict[int, Thread] = {}
         self._stops = 0
+        self._quiet: dict[str, int] = {}
         self.kept = KeptLocks(
             self.client,
             sight,
@@ -121,6 +125,7 @@ class ClientNode(Host):
             now=lambda: self.local_ns,
             say=lambda shard, message: self.call(shard, message, lambda _answer: None),
         )
+        self.kept.listens = self.listen
 
     # ---------------------------------------------------------------- threads
 
@@ -192,7 +197,7 @@ class ClientNode(Host):
 
         self._network.send(self, host, request, lambda came: host.request(came, reply))
         patience_ns = CALL_NS
-        if isinstance(request, Acquire):
+        if isinstance(request, Acquire) or (isinstance(request, KeepAlive) and request.wait_ns):
             patience_ns += request.wait_ns
         elif isinstance(request, Hello | KeepAlive):
             patience_ns = CALL_NS // 2
@@ -279,6 +284,40 @@ class ClientNode(Host):
         if answer is not None:
             self.learn(shard, answer)
             self.client.answered(shard, request, answer, self.local_ns)
+        self.kept.give_back()
+
+    def listen(self, shard: str) -> None:
+        """Listen for recalls of a shard, unless this client does so already."""
+        if shard not in self._quiet:
+            self._quiet[shard] = 0
+            self._ask_for_recalls(shard)
+
+    def _ask_for_recalls(self, shard: str) -> None:
+        starves = self.world.now_ns < self.starves_until_ns
+        if starves or self.client.needs_hello(shard):
+            self.later(QUIET_NS, lambda: self._ask_for_recalls(shard))
+            return
+        asked_ns = self.local_ns
+        question = self.client.keep_alive(shard, asked_ns, wait_ns=SLICE_NS)
+        self.call(shard, question, partial(self._hears, shard, question, asked_ns))
+
+    def _hears(self, shard: str, question: Request, asked_ns: int, answer: Answer | None) -> None:
+        """Take word of recalls, or none, as the thread of `link.client.kept` does."""
+        word = isinstance(answer, Alive) and any(grant.recalled for grant in answer.grants)
+        early = self.local_ns - asked_ns < SLICE_NS // 2
+        if answer is not None:
+            self.client.answered(shard, question, answer, self.local_ns)
+        if not word and not early:
+            self.client.kept.rest(shard)
+        self.world.tally["words of a recall"] += word
+        self._quiet[shard] = 0 if self.client.far(shard) else self._quiet[shard] + 1
+        self.kept.give_back()
+        if self._quiet[shard] >= QUIET_MAX:
+            del self._quiet[shard]
+        elif early and not word:
+            self.later(QUIET_NS, lambda: self._ask_for_recalls(shard))
+        else:
+            self._ask_for_recalls(shard)
 
     def learn(self, shard: str, answer: Answer, *, sent_in: int = 0) -> None:
         """Take the catalogue that an answer carries, as `link.client.session` does."""
@@ -317,6 +356,7 @@ class ClientNode(Host):
         self.end_life()
         self._calls.clear()
         self._stopped.clear()
+        self._quiet.clear()
         self.kept.vanish()
         self.files.vanish()
         self.threads_left = 0

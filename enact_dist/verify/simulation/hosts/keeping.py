@@ -4,7 +4,9 @@ The shard's side is the real `ShardMarks`.  Its pages are simulated: cells stay 
 process dies, marks vanish with the client's process.  A client stops for a while between any two of
 its steps, and dies, sleeps or loses its shard there; while a shard looks at marks, clients go on.
 
-Some clients are on another host than their shards, some on a file system without locks.
+Some clients are on a file system without locks, some on another host than their shards: of these
+some keep nothing, and the others listen for recalls.  What such a client does with a far grant are
+steps of its core alone, so it stands nowhere within them.
 """
 
 from __future__ import annotations
@@ -39,6 +41,7 @@ class Sight(enum.Enum):
     HERE = "on the host of its shards"
     BLIND = "where no locks of files work"
     AWAY = "on another host"
+    FAR = "on another host, and it listens for recalls"
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,7 +196,8 @@ class KeptLocks:
         self._client, self._luck, self._sight = client, luck, sight
         self._marks_of, self._now, self._say = marks_of, now, say
         self._shards: dict[str, _Shared] = {}
-        self.looked: Callable[[KeptGrant, SimulatedPage], None] = lambda _grant, _page: None
+        self.looked: Callable[[KeptGrant, SimulatedPage | None], None] = lambda _grant, _page: None
+        self.listens: Callable[[str], None] = lambda _shard: None
         self.stands: Callable[[str], None] = lambda _shard: None
 
     # ---------------------------------------------------------------- pages
@@ -205,7 +209,7 @@ class KeptLocks:
             return
         if known is not None and known.page is not None:
             known.page.vanish()  # closed with its last reference
-        marks = self._marks_of(shard) if self._sight is not Sight.AWAY else None
+        marks = self._marks_of(shard) if self._sight in (Sight.HERE, Sight.BLIND) else None
         if marks is not None and (marks.epoch != epoch or marks.gone):
             marks = None
         self._shards[shard] = _Shared(epoch, marks)
@@ -213,7 +217,7 @@ class KeptLocks:
     def keeps(self, shard: str) -> bool:
         """Whether a shard may see which of its grants this session uses."""
         shared = self._shards.get(shard)
-        return shared is not None and shared.keeps
+        return self._sight is Sight.FAR or (shared is not None and shared.keeps)
 
     def page(self, shard: str, epoch: int) -> SimulatedPage | None:
         """Return this session's page of one start of a shard; None if there is none here."""
@@ -258,6 +262,8 @@ class KeptLocks:
         grant = self._client.kept.take(items)
         if grant is None:
             return None
+        if grant.far:
+            return self._begin_far(lane, grant, hold_ns)
         self.stands(grant.shard)
         yield Stop(self._luck.choice(FIRST_STOPS_NS))
         page = self.page(grant.shard, grant.token.epoch)
@@ -275,9 +281,27 @@ class KeptLocks:
             page.unmark(number)
         return lock
 
+    def _begin_far(self, lane: int, grant: KeptGrant, hold_ns: int) -> MultiLock | None:
+        now_ns = self._now()
+        lock = self._client.begin_kept(lane, grant, now_ns=now_ns, hold_ns=hold_ns)
+        if lock is not None:
+            self.looked(grant, None)
+        else:
+            self._client.kept.give_back(grant)
+            self.give_back()
+        return lock
+
+    def give_back(self) -> None:
+        """Send the releases of far grants."""
+        given, self._client.kept.given_back = self._client.kept.given_back, []
+        for shard, release in given:
+            self._say(shard, release)
+
     def finish(self, lock: MultiLock) -> Generator[Stop, Any, bool]:
         """End a lock that writes nothing without a call; False if its shard has to be asked."""
         grant = lock.keeping.grant if lock.keeping is not None else None
+        if grant is not None and grant.far:
+            return lock.finish_kept(self._now())
         page = self.page(grant.shard, grant.token.epoch) if grant is not None else None
         if grant is None or page is None or not self._may_stay(grant, page):
             return False
@@ -287,6 +311,7 @@ class KeptLocks:
     def leave(self, lock: MultiLock) -> Generator[Stop, Any, None]:
         """Give the mark of a block back, and keep its grant if that still lives."""
         keeping, part = lock.keeping, lock.parts[0] if lock.parts else None
+        self.give_back()
         if keeping is None or part is None or part.token is None:
             return
         grant, number = keeping.take_grant(), part.token.number
@@ -295,7 +320,9 @@ class KeptLocks:
             yield self._stop(part.shard)
             page.unmark(number)
             keeping.begun_ns = 0
-        if keeping.said == PROVE:
+        if keeping.said == PROVE and self._sight is Sight.FAR:
+            self.listens(part.shard)
+        elif keeping.said == PROVE:
             self._prove(part.shard)
         elif page is not None and grant is not None:
             yield self._stop(part.shard)

@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Protocol, cast
 
-from enact_dist.core.protocol.messages import Answer, Finish, Refused, Request, Stage
+from enact_dist.core.protocol.messages import FAR, Answer, Finish, Refused, Request, Stage
 from enact_dist.core.protocol.records import (
     Call,
     Called,
@@ -179,7 +179,9 @@ class ShardNode(ShardPlace):
             self._give(Tick(), 0)
 
     def is_living(self, tenure: Tenure) -> bool:
-        """Whether a grant is kept: its cell says so, or a block uses it to its end."""
+        """Whether a grant is kept: it is far, its cell says so, or a block uses it to its end."""
+        if tenure.kept == FAR:
+            return not tenure.bound
         page, number = self._page_of(tenure)
         return page is not None and (number in page.numbers() or tenure.recalled)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from enact_dist.core.protocol.datum import LockId, Token
-from enact_dist.core.protocol.messages import Acquire, Commit, Fenced, KeepAlive, Release
+from enact_dist.core.protocol.messages import FAR, Acquire, Commit, Fenced, KeepAlive, Release
 from enact_dist.core.protocol.records import Reply, Tick
 from enact_dist.verify.simulation.judges.history import conflict
 
@@ -176,12 +176,16 @@ class KeepingJudge:
 
     # ---------------------------------------------------------------- clients
 
-    def looked(self, grant: KeptGrant, page: SimulatedPage) -> None:
-        """A client has its mark and reads that its grant lives: the lock begins in this moment."""
+    def looked(self, grant: KeptGrant, page: SimulatedPage | None) -> None:
+        """A client has its mark and reads that its grant lives: the lock begins in this moment.
+
+        Without a page the grant is a far one: it lives as long as its client believes in it.
+        """
         number = grant.token.number
-        cleared = page.cleared.get(number)
-        if cleared is not None and cleared < page.marks[number]:
+        cleared = page.cleared.get(number) if page is not None else None
+        if page is not None and cleared is not None and cleared < page.marks[number]:
             self._fail("R5 no use begins once its cell was cleared", grant.origin, number)
+        self._observed.count("locks begun from afar", page is None)
         picture = self._observed.pictures[grant.shard]
         for state in grant.states:
             newest = picture.now(state.slot)
@@ -214,7 +218,8 @@ class KeepingJudge:
         if marks is None:
             return
         tenures = host.shard.state.tenures.by_lock
-        kept = {t.token.number: t for t in tenures.values() if t.kept and t.token is not None}
+        staying = {t.token.number: t for t in tenures.values() if t.kept and t.token is not None}
+        kept = {number: tenure for number, tenure in staying.items() if tenure.kept != FAR}
         for session, page in marks.made.items():
             for number in page.numbers():
                 if number not in kept or kept[number].lock.session != session:
@@ -225,8 +230,8 @@ class KeepingJudge:
             for number in [number for number in before if number not in kept]:
                 if number in marks.made[before[number]].uses:
                     self._fail("R1 what a block uses is not revoked", host.name, message, number)
-        if isinstance(message, Tick) and kept:
-            self._check_waiters(host, list(kept.values()))
+        if isinstance(message, Tick) and staying:
+            self._check_waiters(host, list(staying.values()))
         for effect in effects:
             if isinstance(effect, Reply) and isinstance(effect.answer, Fenced):
                 asked = host.asked.get(effect.reply_to)
@@ -251,6 +256,10 @@ class KeepingJudge:
                 if not conflict(waiter.items, tenure.items, columns=True):
                     continue
                 assert tenure.token is not None
+                if tenure.kept == FAR:
+                    if not tenure.recalled:
+                        self._fail("R4 what is waited for is recalled", waiter.lock, tenure.lock)
+                    continue
                 page, number = marks.made[tenure.lock.session], tenure.token.number
                 if number in page.numbers():
                     self._fail("R4 what is waited for is recalled", waiter.lock, tenure.lock)

@@ -43,7 +43,7 @@ RESTS_NS: Final = tuple(ms * MS for ms in (0, 1, 5, 30, 150))
 WORKS_NS: Final = tuple(ms * MS for ms in (0, 0, 0, 5, 20, 100))
 SETS: Final = 3
 """Sets of data in a cell that are locked again and again."""
-SIGHTS: Final = (*[Sight.HERE] * 8, Sight.BLIND, Sight.AWAY)
+SIGHTS: Final = (*[Sight.HERE] * 6, *[Sight.FAR] * 4, Sight.BLIND, Sight.AWAY)
 ASKED: Final = 0.7
 """Share of the commits without an answer of which a client asks later what became of them."""
 
