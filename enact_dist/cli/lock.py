@@ -69,8 +69,8 @@ VERBS: Final = (
     Verb(
         "ls",
         "list who holds what and who waits for whom; `kept` is a grant that stays between two locks"
-        " and ends when another process asks, `kept, used` one that a block uses, `recalled` the"
-        " same while another lock waits",
+        " and ends when another process asks, `kept, used` one that a block uses, `recalled` one"
+        " that another lock waits for",
         "list_locks",
         "enact lock ls",
         READER,
@@ -297,7 +297,7 @@ def break_lock(cell: Cell, options: argparse.Namespace) -> Output:
     broken = cell.break_lock(number, shard=shard, reason=reason)
     if broken is None:
         raise MisuseError(f"shard {shard} knows no lock {number}; see enact lock ls")
-    state = ("kept" if broken.kept == "unused" else "held") if broken.granted else "awaited"
+    state = ("kept" if broken.state == "kept" else "held") if broken.granted else "awaited"
     return Output(broken, f"broke lock {number} on {shard}, {state} by {who(broken)}: {reason}")
 
 

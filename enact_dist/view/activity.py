@@ -150,7 +150,7 @@ def held_of(locks: Iterable[LockInfo]) -> dict[str, str]:
     return {
         slot.partition(" (")[0]: lock_mark(lock)  # without how it is locked
         for lock in locks
-        if lock.granted and lock.kept != "unused"
+        if lock.granted and lock.state != "kept"
         for slot in lock.slots
     }
 

@@ -12,16 +12,16 @@ from typing import Final
 from enact_dist.core.protocol import parts
 from enact_dist.terms import NAME_LENGTH_MAX
 
-FRAME_VERSION: Final = 11
+FRAME_VERSION: Final = 12
 """Version of the frames; both ends must speak the same.  2: commits over shards; 3: a WELCOME
 names shared memory; 5: a datum may name a payload in place of its bytes; 7: an identity stands in
 the key of each request and token, and where a socket is opened; an aspect names the types that its
 own has succeeded; listings come in pages; whether a shard is there is asked by a ping, whose answer
-names the start of its daemon; a
-request that waits for a stamp names its session; 8: a session may keep a grant, whose token a later
-commit names; 9: a lock may wait for news before it enters the queue; 10: a payload may ask for
-files of the next ones; 11: a notice may carry data, and a refusal has `facts` for the
-attributes of its error."""
+names the start of its daemon; a request that waits for a stamp names its session; 8: a session may
+keep a grant, whose token a later commit names; 9: a lock may wait for news before it enters the
+queue; 10: a payload may ask for files of the next ones; 11: a notice may carry data, and a refusal
+has `facts` for the attributes of its error; 12: a grant may stay with a session of another host,
+whose signs of life ask for recalls."""
 DATUM_VERSION: Final = 1
 """Version of the encoding of data; these are stored, so old versions stay readable."""
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.access.arguments import checked_as
 from enact_dist.access.asking import ask_all, expected, present_ns
 from enact_dist.core.protocol.messages import (
+    MERELY_KEPT,
     OVERLOAD,
     Dropped,
     DropWorld,
@@ -173,7 +174,7 @@ def _refuse_locked(session: Session, name: str) -> None:
     """Raise while a slot of a context is locked, before any shard has dropped it."""
     for _, answer in ask_all(session.client, Locks, ListLocks()):
         for holder in answer.holders:
-            used = holder.kept != "unused"  # else its shard takes the grant back
+            used = holder.kept not in MERELY_KEPT  # else its shard takes the grant back
             if used and any(slot.startswith(f"{name}:") for slot in holder.slots):
                 raise MisuseError(
                     f"world context {name!r} is not dropped: {holder_line(holder)}; end that lock"

@@ -128,8 +128,9 @@ class LockInfo:
             which its shard does not know.
         waits_for: Numbers of the locks that block it.
         kept: How a grant is used that stays with its session between two blocks: "unused" (it ends
-            as soon as another lock asks for its data), "used", or "recalled" (used, and over with
-            that block); "" of any other lock.
+            as soon as another lock asks for its data), "used", "far" (on a host without memory in
+            common, so the shard does not know), or "recalled" (another lock waits for it: it ends
+            with its block, or once a far session has heard); "" of any other lock.
     """
 
     shard: str
@@ -149,13 +150,13 @@ class LockInfo:
 
     @property
     def state(self) -> str:
-        """How it stands, as `enact lock ls` shows it; "kept" delays no other lock."""
+        """How it stands, as `enact lock ls` shows it; "kept" delays no other lock for long."""
         if not self.granted:
             return "waits"
         return _STATES.get(self.kept, "held")
 
 
-_STATES: Final = {"unused": "kept", "used": "kept, used", "recalled": "recalled"}
+_STATES: Final = {"unused": "kept", "far": "kept", "used": "kept, used", "recalled": "recalled"}
 
 
 @dataclass(frozen=True, slots=True)

@@ -61,7 +61,7 @@ _ANSWERS = {
     messages.Alive: lambda a: (
         "alive",
         a.count_seen,
-        frozenset((grant.lock, grant.hold_left_ns) for grant in a.grants),
+        frozenset((grant.lock, grant.hold_left_ns, grant.recalled) for grant in a.grants),
     ),
     messages.Committed: lambda a: (
         "committed",

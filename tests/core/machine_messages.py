@@ -246,7 +246,10 @@ class Plans:
         """Renews, and wants everything from this seq (or above it) on."""
         view = (LaneView(lock.lane, lock.seq + above),)
         epoch = self.pair.shard.epoch - (pick.below(12) == 0)
-        return KeepAlive(lock.session, epoch, next(self.counts), view, b"")
+        wait_ns = pick.one((0, 0, 50 * MS, 60_000 * MS)) if not above else 0
+        mine = [life for life in self.pair.reference.of(lock.session) if life.far]
+        heard = tuple(life.token.number for life in mine if pick.below(2))
+        return KeepAlive(lock.session, epoch, next(self.counts), view, b"", wait_ns, heard)
 
     def unwanted(self, lock, pick):
         return self.keep_alive(lock, pick, above=1)

@@ -264,7 +264,25 @@ def revokes_what_a_block_uses(patch):
     patch(KeptGrants, "recall", wrong)
 
 
+def no_word_of_a_recall(patch):
+    """Whoever listens hears of a recall when its slice ends."""
+    patch(SessionHandler, "tell_recalled", lambda handler: list(handler._tell(())))
+
+
+def no_lease_more_for_a_far_block(patch):
+    """A far grant is over before a block that has not heard of its recall need be."""
+    recall = KeptGrants.recall
+
+    def wrong(self, tenure, *, now_ns):
+        tenure.unheard_ns = 0
+        recall(self, tenure, now_ns=now_ns)
+
+    patch(KeptGrants, "recall", wrong)
+
+
 ALL = (
+    no_word_of_a_recall,
+    no_lease_more_for_a_far_block,
     any_seq_under_a_kept_grant,
     keeps_though_another_waits,
     repeated_answer_says_that_it_is_over,

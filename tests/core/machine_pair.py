@@ -317,8 +317,11 @@ class Pair:
         }
         self.same("phases (held, bound, token, prepared), (kept, recalled)", phases, wanted)
         cells = {number for page in self.marks.cells.values() for number in page}
-        numbers = {i.token.number for i in reference.lives.values() if i.kept and not i.recalled}
+        near = [life for life in reference.lives.values() if life.kept and not life.far]
+        numbers = {life.token.number for life in near if not life.recalled}
         self.same("cells", cells, numbers)
+        far = [life for life in reference.lives.values() if life.far]
+        self.tally["far grants recalled"] += any(life.recalled for life in far)
         waiting = sorted(
             (t.claim.ticket, lock) for lock, t in tenures.items() if not t.claim.granted
         )

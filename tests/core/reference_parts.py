@@ -107,6 +107,7 @@ class Life:
     keepable: bool = False
     asks_to_keep: bool = False
     kept: bool = False
+    far: bool = False
     recalled: bool = False
 
     @staticmethod

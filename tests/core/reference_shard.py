@@ -54,6 +54,7 @@ class ReferenceSessions(ReferenceKeeping):
         self.by_hand: dict[str, object] = {}
         self.number = 0
         self.rows, self.used = {}, set()
+        self.listening, self.untold = {}, set()
         self.draining = False
         self.disk: list[tuple] = before.disk[:keep] if before else []
         self.ended: dict[LockId, str] = dict(before.ended) if before else {}
@@ -98,6 +99,7 @@ class ReferenceSessions(ReferenceKeeping):
         self.out = Expected()
         getattr(self, f"on_{type(message).__name__.lower()}")(message, handle)
         self.answer_views()
+        self.tell_untold()
         self.grant()
         return self.out
 
@@ -213,12 +215,10 @@ class ReferenceSessions(ReferenceKeeping):
         for life in self.of(m.session):
             if life.lock.seq < lowest.get(life.lock.lane, 0) and not (life.bound or life.kept):
                 self.end(life, "given back")
-        left = {
-            (life.lock, max(0, life.hold_end_ns - self.now_ns))
-            for life in self.of(m.session)
-            if life.held
-        }
-        self.answer(handle, "alive", person.count, frozenset(left))
+        if m.wait_ns:
+            self.listen(m, handle)
+        else:
+            self.answer(handle, *self.alive_of(m.session))
 
     def renew(self, person: Person, count: int) -> None:
         """Whatever is counted renews."""
@@ -238,6 +238,7 @@ class ReferenceSessions(ReferenceKeeping):
                 self.end(life, "taken")
         self.session_over(session)
         person = self.people.pop(session)
+        self.answer_listener(session)
         if person.token:
             self.tokens_elsewhere.add(session)
         self.end_grace_early()
@@ -372,6 +373,8 @@ class ReferenceSessions(ReferenceKeeping):
         self.table.remove(life.lock)
         del self.lives[life.lock]
         self.ended[life.lock] = how
+        if life.far and how == "taken":
+            self.untold.add(life.lock.session)
 
     def drop(self, life: Life) -> None:
         """A waiter loses its place and may ask again."""
@@ -417,6 +420,9 @@ class ReferenceSessions(ReferenceKeeping):
         for life in list(self.lives.values()):
             if life.parked is not None and life.slice_end_ns <= self.now_ns:
                 self.unpark(life)
+        for session, (_, end_ns) in list(self.listening.items()):
+            if end_ns <= self.now_ns:
+                self.answer_listener(session)
         self.ask_and_tell()
         facts = self.forgotten_facts()
         if facts:
@@ -435,6 +441,8 @@ class ReferenceSessions(ReferenceKeeping):
             self.take_back(life)
         for life in self.lives.values():
             self.unpark(life)
+        for session in list(self.listening):
+            self.answer_listener(session)
 
     def on_listlocks(self, _, handle):
         found = [(i.number, i.lock, i.held, self.use_of(i)) for i in self.lives.values()]
@@ -446,6 +454,7 @@ class ReferenceSessions(ReferenceKeeping):
     def deadlines_ns(self) -> list[int]:
         """Return the times at which something is due."""
         due = [self.grace_end_ns] if self.in_grace else []
+        due += [end_ns for _, end_ns in self.listening.values()]
         for life in self.lives.values():
             person = self.people.get(life.lock.session)
             if person is not None and not life.bound:

@@ -28,6 +28,7 @@ COUNTED = (
     "by stamp: replaced",
     "by stamp: outside retention",
     "by stamp: as of the past",
+    "far grants recalled",
 )
 
 

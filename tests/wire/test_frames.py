@@ -55,7 +55,7 @@ def test_frame_header_is_an_array_of_version_code_and_fields():
     """The documented layout, byte by byte: another language depends on it."""
     header, payload = encode_frame(m.Validate(LOCK, Token(9, 1)))
 
-    head, rest = bytes([0x96, 11, 9, 0x93, 0xA6]), bytes([3, 17, 0x92, 9, 1, 0x90, 0xC2])
+    head, rest = bytes([0x96, 12, 9, 0x93, 0xA6]), bytes([3, 17, 0x92, 9, 1, 0x90, 0xC2])
     assert header == head + b"a1b2c3" + rest
     assert payload is None
 

@@ -226,7 +226,8 @@ def test_kept_grants_have_the_figures_of_the_page():
     """File, cells and answers, by which another language keeps grants."""
     assert f"the file `{page_name('SESSION')}` in the shard's folder, {PAGE_BYTES} bytes" in TEXT
     assert f"{tenure.KEPT_OF_SESSION_MAX} cells, unsigned integers of 8 bytes" in TEXT
-    assert (m.NOT_KEPT, m.PROVE, m.PLACES) == (0, 1, 2)
+    assert (m.NOT_KEPT, m.PROVE, m.PLACES, m.FAR) == (0, 1, 2, 255)
+    assert f"{m.FAR} (it stays, see" in TEXT
     assert f"is {m.NOT_KEPT} (the grant is over), {m.PROVE} (it is over, and the client" in TEXT
     assert f"or {m.PLACES} + *n*: the grant stays, and cell *n*" in TEXT
 

@@ -76,6 +76,12 @@ class Client(ClientSession[MultiLock]):
         self._locks[lock.lock] = lock
         return lock
 
+    def far(self, shard: str) -> bool:
+        """Whether this session keeps far grants of a shard, in use or not."""
+        used = [lock.keeping.grant for lock in self.live_locks() if lock.keeping is not None]
+        mine = (*self.kept.by_items.values(), *used)
+        return any(grant is not None and grant.far and grant.shard == shard for grant in mine)
+
     def works(self) -> bool:
         """Whether some thread holds a lock, or stands in a queue for one."""
         locks = list(self._locks.values())

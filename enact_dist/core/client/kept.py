@@ -6,10 +6,15 @@
 
 Who drives a lock does what touches the page of marks, in this order; the rest is decided here.
 
+A shard without memory in common says `FAR`: its grant has neither mark nor cell.  The steps of a
+block are then steps of this core alone, and an answer to a keep-alive says that it is recalled:
+what no block uses is given back at once, what one uses with its end.
+
 Rules a change must keep
   * A lock begins only after the mark was taken and the cell found to hold the grant's number.
   * The mark is given back before the cell is looked at again; only then may the grant be put back.
   * A grant stays only after a clear answer, or where nothing was sent.
+  * A far grant goes from idle to in use, and back, in one step: word of a recall finds it in one.
   * What a grant shows is what it was given with, or what its session has committed since.
 """
 
@@ -19,7 +24,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
 from enact_dist.core.client.plan import Phase
-from enact_dist.core.protocol.messages import NOT_KEPT, PLACES
+from enact_dist.core.protocol.messages import FAR, NOT_KEPT, PLACES, Release
 from enact_dist.core.protocol.records import Content
 from enact_dist.core.state.slots import state_of
 from enact_dist.terms import NullReason
@@ -46,6 +51,8 @@ class KeptGrant:
         count: The session's message counter when it was granted.
         until_ns: Until when it may be believed in (CLOCK_BOOTTIME).
         values: What its blocks have decoded, by slot; not looked at here.
+        far: It has no cell: client and shard share no memory.
+        rested: A far one was in no use since it was last asked.
     """
 
     items: tuple[Item, ...]
@@ -58,6 +65,8 @@ class KeptGrant:
     count: int
     until_ns: int
     values: dict[Slot, Any] = field(default_factory=dict)
+    far: bool = False
+    rested: bool = False
 
     @property
     def shard(self) -> str:
@@ -76,12 +85,20 @@ class KeptGrant:
 
 
 class OwnGrants:
-    """The kept grants of one session, none of them in use; by what was requested."""
+    """The kept grants of one session, none of them in use; by what was requested.
 
-    __slots__ = ("by_items",)
+    Attributes:
+        by_items: The grants.
+        recalled: The far grants in use of which word has come, by shard and number.
+        given_back: The releases of far grants, to be sent.
+    """
+
+    __slots__ = ("by_items", "given_back", "recalled")
 
     def __init__(self) -> None:
         self.by_items: dict[tuple[Item, ...], KeptGrant] = {}
+        self.recalled: set[tuple[str, Token]] = set()
+        self.given_back: list[tuple[str, Release]] = []
 
     def take(self, items: tuple[Item, ...]) -> KeptGrant | None:
         """Return the grant of these requests for one thread alone; None if there is none."""
@@ -93,6 +110,7 @@ class OwnGrants:
 
     def drop(self, shard: str) -> None:
         """Forget what a shard granted: it restarted, or forgot this session."""
+        self.recalled = {each for each in self.recalled if each[0] != shard}
         for items, grant in list(self.by_items.items()):
             if grant.shard == shard:
                 self.by_items.pop(items, None)
@@ -113,6 +131,51 @@ class OwnGrants:
                 grant.until_ns = max(grant.until_ns, until_ns)
             elif grant.count < asked:
                 self.by_items.pop(items, None)
+
+    def hear(self, shard: str, left: Iterable[GrantLeft], used: set[Token | None]) -> None:
+        """Give back the recalled far grants that no block uses, forgotten ones, too.
+
+        Args:
+            shard: Whose word it is.
+            left: What the shard lists.
+            used: The tokens there of the locks that are not at rest.
+        """
+        for lock, token, _, recalled in left:
+            if not recalled:
+                continue
+            if token in used:
+                self.recalled.add((shard, token))
+                continue
+            for items, grant in list(self.by_items.items()):
+                if (grant.shard, grant.token) == (shard, token):
+                    self.by_items.pop(items, None)
+            self.given_back.append((shard, Release(lock)))
+
+    def heard(self, shard: str) -> tuple[int, ...]:
+        """Return the numbers of a shard's grants in use of whose recall it need not say more."""
+        return tuple(sorted(token.number for one, token in self.recalled if one == shard))
+
+    def settle(self, keeping: Keeping) -> None:
+        """Take a far grant from its block: it is put back, or given back if it was recalled."""
+        grant = keeping.take_grant()
+        assert grant is not None
+        if (grant.shard, grant.token) in self.recalled:
+            self.give_back(grant)
+        else:
+            grant.rested = False
+            self.put_back(grant)
+
+    def give_back(self, grant: KeptGrant) -> None:
+        """Give a grant back that is in no table."""
+        self.given_back.append((grant.shard, Release(grant.origin)))
+
+    def rest(self, shard: str) -> None:
+        """Give back the far grants of a shard that were in no use since this was last called."""
+        for items, grant in list(self.by_items.items()):
+            if grant.far and grant.shard == shard:
+                if grant.rested:
+                    self.give_back(self.by_items.pop(items))
+                grant.rested = True
 
 
 @dataclass(slots=True, eq=False)
@@ -163,6 +226,7 @@ class Keeping:
                 tuple([reading.state for reading in lock.states]),
                 part.granted_count,
                 part.until_ns,
+                far=said == FAR,
             )
 
     def take_grant(self) -> KeptGrant | None:

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
-from enact_dist.core.client.kept import OwnGrants
+from enact_dist.core.client.kept import Keeping, OwnGrants
 from enact_dist.core.client.lease_clock import Sendings
 from enact_dist.core.client.own_commits import Unsettled
 from enact_dist.core.client.plan import Part, Phase, Plan
@@ -48,6 +48,7 @@ class HeldThere(Protocol):
     lock: LockId
     phase: Phase
     parts: list[Part]
+    keeping: Keeping | None
 
     def lose_at(self, shard: str, cause: str) -> None:
         """Take in that a shard has dropped its grant."""
@@ -258,8 +259,8 @@ class ClientSession(Generic[L]):
 
     # ---------------------------------------------------------------- keep-alive
 
-    def keep_alive(self, shard: str, now_ns: int) -> Request:
-        """Return the next sign of life for a shard."""
+    def keep_alive(self, shard: str, now_ns: int, *, wait_ns: int = 0) -> Request:
+        """Return the next sign of life for a shard; with `wait_ns`, one that awaits recalls."""
         if self.needs_hello(shard):
             return self.hello(shard)
         live: dict[int, int] = {lane: seq + 1 for lane, seq in self._seqs.items()}
@@ -267,7 +268,9 @@ class ClientSession(Generic[L]):
             live[lock.lane] = min(lock.seq, live[lock.lane])
         view = tuple([LaneView(lane, seq) for lane, seq in live.items()])
         count = self.sendings.next(now_ns)
-        return KeepAlive(self.session, self.epoch(shard), count, view, self.report)
+        heard = self.kept.heard(shard) if wait_ns else ()
+        epoch = self.epoch(shard)
+        return KeepAlive(self.session, epoch, count, view, self.report, wait_ns, heard)
 
     def _alive(self, shard: str, request: KeepAlive, answer: Alive, now_ns: int) -> None:
         if answer.epoch != self.epoch(shard):
@@ -277,6 +280,10 @@ class ClientSession(Generic[L]):
         believe = self.sendings.believe_until_ns
         until_ns = believe(answer.count_seen, self.ttl_ns)
         self.kept.alive(shard, left, asked=request.count, until_ns=until_ns)
+        if any(grant.recalled for grant in answer.grants):
+            parts = (part for lock in self._locks.values() for part in lock.parts)
+            used = {part.token for part in parts if part.shard == shard}
+            self.kept.hear(shard, answer.grants, used)
         for lock in list(self._locks.values()):
             for part in lock.parts:
                 if part.shard != shard or part.token is None:
@@ -331,8 +338,16 @@ class ClientSession(Generic[L]):
         )
 
     def ended(self, lock: L) -> None:
-        """Forget a lock that rests; called by the lock itself."""
+        """Forget a lock that rests; called by the lock itself.
+
+        Its far grant stays here in the same step, or is given back.
+        """
         self._locks.pop(lock.lock, None)
+        keeping = lock.keeping
+        if keeping is not None and keeping.grant is not None and keeping.grant.far:
+            self.kept.settle(keeping)
+        if self.kept.recalled:
+            self.kept.recalled -= {(part.shard, part.token) for part in lock.parts}
 
     def ask_again(self) -> None:
         """A shard has come back: no lock need wait any longer before it asks again."""

@@ -149,7 +149,8 @@ class Committed:
     """All writes of the lock are visible.
 
     `kept` says whether the grant is over (`NOT_KEPT`, `PROVE`) or stays with the session: then it
-    is `PLACES` plus the cell of its session's page that holds its number as long as it lives.
+    is `PLACES` plus the cell of its session's page that holds its number as long as it lives, or
+    `FAR` for a session that listens for recalls.
     """
 
     lock: LockId

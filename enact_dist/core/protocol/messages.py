@@ -74,9 +74,11 @@ from enact_dist.core.protocol.answers import (
 from enact_dist.core.protocol.parts import (
     CAUSE_COMMIT,
     CAUSE_FORK,
+    FAR,
     HOLD_NS_MAX,
     INLINE_BYTES_MAX,
     ITEMS_MAX,
+    MERELY_KEPT,
     NO_LIMIT,
     NO_PLACE,
     NOT_KEPT,

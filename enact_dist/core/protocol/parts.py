@@ -85,7 +85,8 @@ class Holder(NamedTuple):
     """The holder or waiter of a lock, for messages to people.
 
     `kept` says of a grant that stays with its session between two blocks how it is used: "unused",
-    "used", or "recalled" (in use, while another lock waits); "" of any other.
+    "used", "far" (its session shares no memory with the shard, which does not know), or "recalled"
+    (another lock waits for one that was used or far); "" of any other.
     """
 
     lock: LockId
@@ -193,11 +194,16 @@ class LaneView(NamedTuple):
 
 
 class GrantLeft(NamedTuple):
-    """A live grant as the shard sees it."""
+    """A live grant as the shard sees it.
+
+    `recalled`: another lock waits for it; once no block uses it, it is to be given back, by a
+    `Release` of `lock`.  Only said of what is kept `FAR`.
+    """
 
     lock: LockId
     token: Token
     hold_left_ns: int
+    recalled: bool = False
 
 
 NO_PLACE: Final = 0
@@ -206,10 +212,14 @@ NOT_KEPT: Final = 0
 """Of a grant that is over."""
 PROVE: Final = 1
 """It is over, too, and the client shall first lock byte 0 of its page, which proves that the shard
-sees the locks of this client's files."""
+sees the locks of this client's files; or it shall ask for word of recalls (`KeepAlive.wait_ns`)."""
 PLACES: Final = 2
 """From here on: the grant stays with its session, and its number stands in the cell of this number
 less `PLACES`."""
+FAR: Final = 255
+"""It stays without a cell: client and shard share no memory, and word tells when it is recalled."""
+MERELY_KEPT: Final = ("unused", "far")
+"""What `Holder.kept` says of a grant that ends when another lock asks, as far as known."""
 
 
 class AspectEntry(NamedTuple):

@@ -118,6 +118,8 @@ class KeepAlive:
     grant ends here.  `count` increases with each message of the session; the client remembers when
     it sent which, and trusts its locks by *sending* times only.
     `report` is the actor's own statistics (msgpack), shown by `enact actor ls`.
+    With `wait_ns` the session listens for recalls: the shard keeps the request so long, at most a
+    slice, unless one of its grants is recalled whose number is not in `heard`.
     """
 
     session: str
@@ -125,6 +127,8 @@ class KeepAlive:
     count: int
     view: tuple[LaneView, ...]
     report: bytes
+    wait_ns: int = 0
+    heard: tuple[int, ...] = ()
 
 
 @message

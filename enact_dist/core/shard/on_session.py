@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 from enact_dist.core.protocol.checks import wrong_aspect, wrong_name
 from enact_dist.core.protocol.messages import (
     DATUM_TYPE,
+    FAR,
     OVERLOAD,
     REPORT_BYTES_MAX,
     Alive,
@@ -40,6 +41,8 @@ from enact_dist.core.protocol.records import (
 )
 from enact_dist.core.rights.rules import UNPROVEN
 from enact_dist.core.shard import owners
+from enact_dist.core.state.clock import DueTimes
+from enact_dist.core.state.grants import WAIT_SLICE_NS_MAX
 from enact_dist.terms import Durability
 
 if TYPE_CHECKING:
@@ -59,6 +62,8 @@ class SessionHandler:
         self._state = state
         self._unanswered: dict[int, list[Reply]] = {}
         self._recording: dict[str, SessionState] = {}
+        self._listening: dict[str, int] = {}
+        self._ends = DueTimes[str]()
         self._count = 0
 
     def on_hello(self, message: Hello, reply_to: int) -> Iterator[Effect]:
@@ -223,21 +228,83 @@ class SessionHandler:
         self._state.pins.drop_older(message.session, lowest)
         if self._state.standing.by_lane:
             yield from self._state.standing.drop_session(message.session, lowest)
-        now_ns, numbers = (
-            self._state.now_ns,
-            (session.count_seen, self._state.commits.notice_number),
-        )
-        grants = tuple(
-            [
-                GrantLeft(tenure.lock, tenure.token, max(0, tenure.hold_end_ns - now_ns))
-                for tenure in self._state.tenures.of_session(message.session)
-                if tenure.token is not None
-            ]
-        )
-        yield Reply(reply_to, Alive(self._state.epoch, *numbers, self._state.stamp(), grants))
+        if message.wait_ns > 0 and proven:
+            yield from self._listen(message, session, reply_to)
+        else:
+            yield Reply(reply_to, self._alive(session))
+
+    def _alive(self, session: SessionState) -> Alive:
+        """Return which grants of a session live, and which of them are recalled."""
+        state = self._state
+        grants = [
+            GrantLeft(
+                tenure.lock,
+                tenure.token,
+                max(0, tenure.hold_end_ns - state.now_ns),
+                tenure.recalled and tenure.kept == FAR,
+            )
+            for tenure in state.tenures.of_session(session.session)
+            if tenure.token is not None
+        ]
+        number, stamp_ns = state.commits.notice_number, state.stamp()
+        return Alive(state.epoch, session.count_seen, number, stamp_ns, tuple(grants))
+
+    # ---------------------------------------------------------------- word of recalls
+
+    def _listen(self, message: KeepAlive, session: SessionState, reply_to: int) -> Iterator[Effect]:
+        """Keep the question of a session that keeps grants without memory in common with us."""
+        state, name = self._state, message.session
+        kept = state.tenures.kept
+        yield from self._tell((name,))
+        if state.draining or not kept.recalled_of(name).issubset(message.heard):
+            yield Reply(reply_to, self._alive(session))
+            return
+        self._listening[name], kept.listening[name] = reply_to, session.ttl_ns
+        self._ends.put(name, state.now_ns + min(message.wait_ns, WAIT_SLICE_NS_MAX))
+
+    def _tell(self, sessions: Iterable[str]) -> Iterator[Effect]:
+        """Answer those of these sessions that listen."""
+        for name in sessions:
+            reply_to = self._listening.pop(name, None)
+            if reply_to is not None:
+                self._ends.drop(name)
+                self._state.tenures.kept.listening.pop(name)
+                session = self._state.sessions.by_id.get(name)
+                yield Reply(
+                    reply_to,
+                    EpochChanged(self._state.epoch) if session is None else self._alive(session),
+                )
+
+    def tell_recalled(self) -> list[Effect]:
+        """Send word of the far grants that were recalled or taken, to those that listen."""
+        kept = self._state.tenures.kept
+        untold, kept.untold = kept.untold, {}
+        return list(self._tell(untold))
+
+    def end_slices(self, now_ns: int) -> Iterator[Effect]:
+        """Answer those that have listened for a slice."""
+        yield from self._tell(self._ends.take(now_ns))
+
+    def end_all(self) -> Iterator[Effect]:
+        """Answer all that listen: this shard ends."""
+        yield from self._tell(list(self._listening))
+
+    def next_deadline_ns(self) -> int | None:
+        """Return when the next slice of listening ends."""
+        return self._ends.next_ns()
+
+    def assert_invariants(self) -> None:
+        """Assert the bookkeeping of those that listen.  For tests and simulation."""
+        kept = self._state.tenures.kept
+        assert self._listening.keys() == kept.listening.keys() == self._ends.due.keys()
+        assert not kept.untold
+
+    # ---------------------------------------------------------------- ends
 
     def on_goodbye(self, message: Goodbye, reply_to: int) -> Iterator[Effect]:
         """End a session at its own wish."""
+        for tenure in self._state.tenures.kept.left_by(message.session):
+            yield from self._state.tenures.remove(tenure, now_ns=self._state.now_ns)
         yield from self.end(message.session, "its session said goodbye")
         yield Reply(reply_to, Released())
 
@@ -271,6 +338,7 @@ class SessionHandler:
         self._state.pins.drop_session(session)
         yield from self._state.standing.drop_session(session)
         self._state.sessions.forget(session)
+        yield from self._tell((session,))
         self._state.tenures.session_ended(session)
         self._state.tenures.kept.session_ended(session)
         self._state.sessions.end_grace_if_all_acknowledged(self._state.now_ns)

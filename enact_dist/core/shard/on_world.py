@@ -29,6 +29,7 @@ from enact_dist.core.protocol.checks import unknown_world, wrong_name
 from enact_dist.core.protocol.datum import LockId, Slot
 from enact_dist.core.protocol.messages import (
     CLOCK_SKEW,
+    FAR,
     HELD,
     OVERLOAD,
     PROTOCOL,
@@ -271,6 +272,9 @@ class WorldHandler:
         for tenure in list(state.tenures.kept.by_number.values()):
             if any(item.context == world for item in tenure.items):
                 state.tenures.kept.recall(tenure, now_ns=state.now_ns)
+                if tenure.kept == FAR:
+                    told = state.tenures.told(tenure, state.now_ns)
+                    return Refused(OVERLOAD, f"{asked}; {told} is recalled; ask again")
         for tenure in state.tenures.by_lock.values():
             item = next((item for item in tenure.items if item.context == world), None)
             if item is not None:

@@ -243,6 +243,8 @@ class Shard:
             ]
             if changed:
                 effects += self._locks.begin_standing(changed)
+        if state.tenures.kept.untold:
+            effects += self._sessions.tell_recalled()
         if state.tenures.table.ready:
             effects += state.grant_ready()
         return effects
@@ -308,7 +310,7 @@ class Shard:
         ]
         for handler in (
             self._prepares, self._stamps, self._views, self._worlds, state.decisions,
-            state.standing,
+            state.standing, self._sessions,
         ):  # fmt: skip
             due_ns = handler.next_deadline_ns()
             if due_ns is not None:
@@ -382,6 +384,7 @@ class Shard:
         yield from self.state.grant_ready()
         yield from self.state.tenures.end_slices(now_ns)
         yield from self.state.standing.end_slices(now_ns)
+        yield from self._sessions.end_slices(now_ns)
         yield from self._stamps.answer_reached()
         yield from self._prepares.ask()
         yield from self.state.decisions.tell(now_ns)
@@ -415,6 +418,7 @@ class Shard:
             if tenure.parked is not None:
                 yield self.state.tenures.waiting(tenure, self.state.now_ns)
         yield from self.state.standing.end_all()
+        yield from self._sessions.end_all()
         yield from self._stamps.answer_all()
 
     # ---------------------------------------------------------------- people
@@ -482,6 +486,7 @@ class Shard:
         self._prepares.assert_invariants()
         self.state.tenures.assert_invariants()
         self.state.standing.assert_invariants()
+        self._sessions.assert_invariants()
         self._worlds.assert_invariants()
         self.state.slots.assert_invariants()
         if self.state.sessions.in_grace(self.state.now_ns):

@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Final
 
 from enact_dist.core.protocol.datum import LockId, Token
 from enact_dist.core.protocol.messages import (
+    FAR,
     HOLD_NS_MAX,
     NOT_KEPT,
     PLACES,
@@ -395,6 +396,8 @@ class Tenures:
             return ""
         if tenure.recalled:
             return "recalled"
+        if tenure.kept == FAR:
+            return "far"
         return "unused" if self.kept.is_unused(tenure) else "used"
 
     def told(self, tenure: Tenure, now_ns: int) -> str:

@@ -8,12 +8,19 @@ a message.  Client and shard agree through a page of shared memory and a file lo
     shard    recalls: clears the cell, then asks for the mark    not taken: over at once
                                                                  taken: over with that block
 
+Where they share no memory, a session that listens for recalls (`KeepAlive.wait_ns`) may keep a
+grant, too, which is then a lock that it still holds.  A recall sends word, and the client gives
+the grant back once no block uses it; if it does not, the end of its lease, or of the hold limit,
+ends it as any lock.
+
 Rules a change must keep
   * The cell is cleared first, and the mark asked for afterwards.  In the other order a recall
     between a client's look and the return of its mark would be missed by both.
   * The cell is cleared at every end of a kept grant: cells outlive the shard's process.
   * Under a kept grant a commit is accepted only with a higher seq than its lane has used.
   * A grant is kept only while no lock waits for what it holds, so no lock is overtaken.
+  * The hold limit of a far grant is longer by a lease: a client that has not heard of the recall
+    may begin a block as long as it believes in its lease, and believe in the block as long again.
 """
 
 from __future__ import annotations
@@ -22,7 +29,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, Protocol
 
 from enact_dist.core.protocol.datum import Column, Datum, LockId, Slot, Token
-from enact_dist.core.protocol.messages import NOT_KEPT, PLACES, Item
+from enact_dist.core.protocol.messages import FAR, NOT_KEPT, PLACES, Item
 from enact_dist.core.state.lock_table import Claim, Mode, Resource, join
 from enact_dist.patterns import pattern_matches
 from enact_dist.terms import ACCESSES, Access
@@ -62,6 +69,7 @@ class Tenure:
         keepable: Whether its grant may stay with the session.
         kept: What the answer said when its grant stayed; 0 while it was not.
         recalled: Another lock waits for a kept grant in use: it ends with that block.
+        unheard_ns: How long its session may begin blocks after a recall that it did not hear of.
     """
 
     lock: LockId
@@ -81,6 +89,7 @@ class Tenure:
     owner: str = ""
     kept: int = NOT_KEPT
     recalled: bool = False
+    unheard_ns: int = 0
     pins: dict[tuple[Slot, int], Datum] = field(default_factory=dict)
 
     @property
@@ -210,7 +219,9 @@ class KeptGrants:
         by_number: All, by the number of their token.
         recalled: Those in use for which another lock waits.
         marks: What client and shard of one host can see of each other.
-        closed: The shard is about to stop and lets no more grants stay.
+        listening: The sessions that listen for recalls now, each with its TTL.
+        untold: Sessions of which a far grant was recalled or taken, and no word was sent yet.
+        closed: The shard lets no more grants stay: it is about to stop, or was started so.
     """
 
     __slots__ = (
@@ -221,14 +232,18 @@ class KeptGrants:
         "_of",
         "by_number",
         "closed",
+        "listening",
         "marks",
         "recalled",
+        "untold",
     )
 
     def __init__(self, counters: dict[str, int], end: Callable[[Tenure], object]) -> None:
         self.by_number: dict[int, Tenure] = {}
         self.recalled: dict[int, Tenure] = {}
         self.marks: UseMarks = _NoMarks()
+        self.listening: dict[str, int] = {}
+        self.untold: dict[str, None] = {}
         self.closed = False
         self._counters, self._end = counters, end
         self._of: dict[str, dict[int, Tenure]] = {}
@@ -276,7 +291,12 @@ class KeptGrants:
             return NOT_KEPT
         assert tenure.token is not None
         number, session = tenure.token.number, tenure.lock.session
-        told = self.marks.keep(session, number) if self._has_room(session, now_ns) else NOT_KEPT
+        if not self._has_room(session, now_ns):
+            told = NOT_KEPT
+        elif session in self.listening:
+            told, tenure.unheard_ns = FAR, self.listening[session]
+        else:
+            told = self.marks.keep(session, number)
         if told < PLACES:
             self._counters["grants_not_kept"] += 1
             return told
@@ -291,7 +311,7 @@ class KeptGrants:
         if len(mine) >= KEPT_OF_SESSION_MAX:
             for number, tenure in mine.items():
                 busy = tenure.committing or tenure.recalled
-                if not busy and not self.marks.used(session, number):
+                if not busy and (tenure.kept == FAR or not self.marks.used(session, number)):
                     self.recall(tenure, now_ns=now_ns)
                     break
         return len(mine) < KEPT_OF_SESSION_MAX and len(self.by_number) < KEPT_MAX
@@ -308,7 +328,8 @@ class KeptGrants:
     def recall(self, tenure: Tenure, *, now_ns: int) -> None:
         """Take a kept grant back, if that was not done before.
 
-        It is over, or a block uses it: then it ends with that block, whose hold limit begins.
+        It is over, or a block uses it: then it ends with that block, whose hold limit begins.  A
+        far one ends when its client has heard, or with a block.
         """
         if tenure.recalled:
             return
@@ -316,18 +337,22 @@ class KeptGrants:
         number = tenure.token.number
         habit = self._habit(tenure)
         habit.row, habit.needed = 0, min(2 * habit.needed, ROW_MAX)
-        unused = self.marks.recall(tenure.lock.session, number)
+        if tenure.kept == FAR:
+            unused, self.untold[tenure.lock.session] = False, None
+        else:
+            unused = self.marks.recall(tenure.lock.session, number)
         if unused and not tenure.committing:
             self._counters["grants_revoked"] += 1
             self._end(tenure)
             return
-        tenure.recalled, tenure.hold_end_ns = True, now_ns + tenure.hold_ns
+        tenure.recalled = True
+        tenure.hold_end_ns = now_ns + tenure.hold_ns + tenure.unheard_ns
         self.recalled[number] = tenure
         self._counters["grants_recalled"] += 1
 
     def is_unused(self, tenure: Tenure) -> bool:
-        """Whether a grant is kept and no block uses it now."""
-        if not tenure.kept or tenure.bound or tenure.token is None:
+        """Whether a grant is kept, not far, and no block uses it now."""
+        if tenure.kept in (NOT_KEPT, FAR) or tenure.bound or tenure.token is None:
             return False
         return not self.marks.used(tenure.lock.session, tenure.token.number)
 
@@ -345,8 +370,9 @@ class KeptGrants:
         """Forget a kept grant that ends, however it does."""
         assert tenure.token is not None
         number, session = tenure.token.number, tenure.lock.session
+        if tenure.kept != FAR:
+            self.marks.over(session, number)
         tenure.kept, tenure.recalled = NOT_KEPT, False
-        self.marks.over(session, number)
         del self.by_number[number]
         self.recalled.pop(number, None)
         mine = self._of[session]
@@ -357,6 +383,8 @@ class KeptGrants:
     def taken(self, tenure: Tenure, cause: str) -> None:
         """Remember why a kept grant was taken away, for the next message that names it."""
         assert tenure.token is not None
+        if tenure.kept == FAR:
+            self.untold[tenure.lock.session] = None
         self._causes[tenure.token.number] = cause
         if len(self._causes) > CAUSES_MAX:
             del self._causes[next(iter(self._causes))]
@@ -375,6 +403,16 @@ class KeptGrants:
         self.marks.drop(session)
         for key in [key for key in self._habits if key[0] == session]:
             del self._habits[key]
+
+    def left_by(self, session: str) -> list[Tenure]:
+        """Return the far grants of a session that says goodbye: it uses none of them."""
+        mine = self._of.get(session, {}).values()
+        return [tenure for tenure in mine if tenure.kept == FAR and not tenure.bound]
+
+    def recalled_of(self, session: str) -> set[int]:
+        """Return the numbers of the recalled far grants of a session."""
+        mine = self._of.get(session, {})
+        return {number for number, one in mine.items() if one.kept == FAR and one.recalled}
 
     def assert_invariants(self, by_lock: dict[LockId, Tenure]) -> None:
         """Assert the bookkeeping.  For tests and simulation."""

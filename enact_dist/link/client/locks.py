@@ -155,7 +155,7 @@ class CellClient(SessionClient):
                     lock.news = AwaitedNews(asked.after, allowed_ns)
                 begun.append(lock)
                 keeps = asked.keep and plan.keepable and not lock_views
-                if keeps and self.payloads.keeps(plan.locks[0][0]):
+                if keeps and self._kept.keeps(plan.locks[0][0]):
                     lock.keeping = Keeping(asked.keep)
                 for before in begun[-2:-1]:
                     before.lane_free = True  # the next lock takes over the lane

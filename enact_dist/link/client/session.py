@@ -121,6 +121,7 @@ class SessionClient:
         self._further = FurtherShards(carrier, client.placement, now_ns, weakly(self.count), doubts)
         self._renewer: threading.Thread | None = None
         if keep_alive:
+            self._kept.listens(carrier, self.pauses, weakref.ref(self))
             self._renewer = threading.Thread(
                 target=keep_renewing,
                 args=(weakref.ref(self), self.pauses),
@@ -154,6 +155,7 @@ class SessionClient:
         finally:
             self.payloads.close()
             self.carrier.close()
+            self._kept.join()
             _alive.discard(self)
 
     def check_usable(self) -> None:
@@ -467,7 +469,6 @@ class SessionClient:
 
         A shard that is known to be away is asked less and less often.
         """
-        self._kept.repair()
         due = self.renewal.due()
         with self._mutex:
             now_ns = self._now_ns()
@@ -480,6 +481,7 @@ class SessionClient:
                     self._shard_returned(shard)
             else:
                 self.count("keep_alives_unanswered")
+        self._kept.repair()
 
     def set_report(self, report: bytes) -> None:
         """Set what the next keep-alives carry: an actor's statistics, msgpack of a map."""

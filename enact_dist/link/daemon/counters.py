@@ -51,12 +51,15 @@ OF_A_SHARD: Final[dict[str, Figure]] = {
     "locks_granted": Figure("locks granted; those that used a kept grant are not counted"),
     "locks_validated": Figure("locks without a write here, confirmed when they ended"),
     "grants_kept": Figure("grants that stayed with their session, for its next locks of the data"),
-    "grants_not_kept": Figure("grants that could not stay: no page of marks, or no room in it"),
+    "grants_not_kept": Figure(
+        "grants that could not stay: no page of marks and no question for recalls, or no room"
+    ),
     "grants_revoked": Figure(
         "kept grants that ended unused, because another lock asked for the data"
     ),
     "grants_recalled": Figure(
-        "kept grants in use when another lock asked; each ended with the block that used it"
+        "kept grants in use, or of another host, when another lock asked; each ended with its"
+        " block, or was given back"
     ),
     "standing_locks_begun": Figure("locks that waited for news, and entered the queue at a change"),
     "lock_waits": Figure(

@@ -201,6 +201,11 @@ class SharedPayloads:
 
     # ---------------------------------------------------------------- kept grants
 
+    def sees(self, shard: str) -> bool:
+        """Whether this process sees the folder of a shard, whatever it may do there."""
+        shared = self._shards.get(shard)
+        return shared is not None and shared.folder is not None
+
     def keeps(self, shard: str) -> bool:
         """Whether a shard may see which of its grants this session uses."""
         shared = self._shards.get(shard)

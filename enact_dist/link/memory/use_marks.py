@@ -113,9 +113,13 @@ class ShardPage:
 
 
 class ShardMarks:
-    """The pages of all sessions of one shard; called under its host's mutex.  See `UseMarks`."""
+    """The pages of all sessions of one shard; called under its host's mutex.  See `UseMarks`.
 
-    def __init__(self, folder: SharedFolder) -> None:
+    A session without a page has to prove that it hears of recalls: by the locks of its file, or
+    by listening for them.
+    """
+
+    def __init__(self, folder: SharedFolder | None) -> None:
         self._folder = folder
         self._pages: dict[str, ShardPage | None] = {}
 
@@ -125,8 +129,8 @@ class ShardMarks:
         if page is None:
             if session not in self._pages:
                 self._pages[session] = self._made(session)
-                return PROVE if self._pages[session] is not None else NOT_KEPT
-            return NOT_KEPT
+            elsewhere = self._folder is None
+            return PROVE if elsewhere or self._pages[session] is not None else NOT_KEPT
         page.proven = page.proven or page.has(PROOF, in_doubt=False)
         if not page.proven or not page.free:
             return NOT_KEPT if page.proven else PROVE
@@ -135,7 +139,7 @@ class ShardMarks:
     def _made(self, session: str) -> ShardPage | None:
         """Make a session's page; None if there is no room for it, or no such locks."""
         folder, name = self._folder, page_name(session)
-        if folder.files < 0:
+        if folder is None or folder.files < 0:
             return None
         flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
         try:
@@ -181,15 +185,17 @@ class ShardMarks:
             self._unlink(session)
 
     def _unlink(self, session: str) -> None:
-        if self._folder.files >= 0:
+        if self._folder is not None and self._folder.files >= 0:
             with contextlib.suppress(FileNotFoundError):
                 os.unlink(page_name(session), dir_fd=self._folder.files)
 
 
 def mark_uses(kept: KeptGrants, folder: SharedFolder | None) -> None:
-    """Let a shard keep grants for the clients that share its folder."""
-    if folder is not None and retains():
+    """Let a shard keep grants for clients that share its folder or listen for recalls."""
+    if retains():
         kept.marks = ShardMarks(folder)
+    else:
+        kept.closed = True
 
 
 class ClientPage:
