@@ -23,10 +23,15 @@ tell("kept")
 hear()
 """
 KEEPS_GOING = """
+from enact_dist.errors import CommitUnknownError, LeaseLostError
+
 keep()
 tell("kept")
 while True:
-    add_one()
+    try:
+        add_one()
+    except (CommitUnknownError, LeaseLostError):
+        pass  # it was stopped in the block
 """
 USES = """
 keep()
@@ -175,6 +180,7 @@ def test_process_that_cannot_answer_holds_up_others_until_its_lease_ends(
     if sent == signal.SIGSTOP:
         os.kill(process.pid, signal.SIGCONT)
         while True:
+            assert process.poll() is None
             with Lock(slot(cell)) as lock:
                 if lock[slot(cell)] > counted:
                     break
