@@ -1,5 +1,6 @@
 """The types of what the public API returns: for annotations and `isinstance`, never to be made."""
 
+from enact_dist.access.reads import EachData
 from enact_dist.access.snapshot import SlotInfo, Snapshot
 from enact_dist.access.watch import Change, Watch
 from enact_dist.actor.report import ActorStatistics
@@ -28,6 +29,7 @@ __all__ = [
     "Diff",
     "DiffKind",
     "DiffWatch",
+    "EachData",
     "EffectTree",
     "LockInfo",
     "NullReason",

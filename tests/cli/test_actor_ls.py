@@ -143,10 +143,12 @@ def test_two_actors_of_one_name_are_told_of(start, until, enact, cell_file):
     assert [line.split()[0] for line in table if "running, one of 2" in line] == ["twin", "twin"]
 
 
-def test_predecessor_that_is_gone_is_no_namesake(caplog):
+def test_predecessor_that_is_gone_is_no_namesake(caplog, monkeypatch):
     """Its session lasts a lease longer; of another host nobody can know."""
     gone = ActorInfo("twin", socket.gethostname(), (1 << 22) + 1, "s1", ("left",), 0.5, 0)
-    cell = SimpleNamespace(sessions_named=lambda _: (gone, replace(gone, host=f"not-{gone.host}")))
+    both = (gone, replace(gone, host=f"not-{gone.host}"))
+    monkeypatch.setattr("enact_dist.world.listings.sessions_named", lambda *_: both)
+    cell = SimpleNamespace(_session=SimpleNamespace(client=None))
 
     _warn_of_same_name(cell, "twin")
 

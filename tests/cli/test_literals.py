@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from enact_dist.cli.text import literals
+from enact_dist.core.protocol.messages import AspectEntry
 from enact_dist.errors import ConfigError, DatumTypeError, MisuseError
 from enact_dist.wire.fingerprint import fingerprint
 from enact_dist.wire.payload import encode_datum
@@ -130,8 +131,9 @@ def test_pickled_array_is_refused(tmp_path):
 
 def test_new_aspect_takes_the_type_of_the_value():
     """--new registers an unknown aspect by its first value, which null does not have."""
+    known = {"b": AspectEntry("b", "int", "os"), "c": AspectEntry("c", "", "os")}
     assert literals.type_to_put("a", {}, "3", new=True) is int
     with pytest.raises(MisuseError, match=r"no aspect 'a' is registered \(known: b\)"):
-        literals.type_to_put("a", {"b": ("int", "os"), "c": ("", "os")}, "3", new=False)
+        literals.type_to_put("a", known, "3", new=False)
     with pytest.raises(MisuseError, match="null does not tell"):
         literals.type_to_put("a", {}, "null", new=True)

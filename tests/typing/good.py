@@ -1,6 +1,5 @@
 """What users write: no line here may be an error of the type checker."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from typing import assert_type
@@ -22,7 +21,7 @@ from enact_dist import (
     WriteEach,
     connect,
 )
-from enact_dist.types import CauseTree, PastContext, Version
+from enact_dist.types import CauseTree, EachData, PastContext, Version
 
 
 @dataclass(frozen=True)
@@ -54,7 +53,7 @@ def count_contacts() -> None:
             assert_type(lock[mesh], Mesh)
             assert_type(lock.get(mesh), Mesh | None)
             assert_type(lock.get(count, 0), int)
-            assert_type(lock[each], Mapping[Entity, Mesh])
+            assert_type(lock[each], EachData[Mesh])
             if lock[mesh].lowest_z_m < 0.0:
                 lock[count] = lock.get(count, 0) + 1
             lock[count] += 1
@@ -83,7 +82,7 @@ def travel(when: datetime) -> None:
         mesh, each = View(past, piece, MESH), ViewEach(past, Entities("view/*"), MESH)
         snapshot = past.view(mesh, each)
         assert_type(snapshot[mesh], Mesh)
-        assert_type(snapshot[each], Mapping[Entity, Mesh])
+        assert_type(snapshot[each], EachData[Mesh])
         assert_type(online.at(when), PastContext)
         assert_type(online.at(1763719200.5), PastContext)
         assert_type(online.at(stamp_ns=17, nearest=True), PastContext)
