@@ -263,6 +263,27 @@ class TestWord:
 
         assert user.granted(waiter)
 
+    def test_is_not_needed_for_a_grant_that_the_client_does_not_know(self, user):
+        """The answer that said that it stays was lost; the next sign of life finds it."""
+        grant = user.kept()
+        user.core.kept.by_items.clear()
+        user.client.keep_alive()
+        assert [release.lock for _, release in user.core.kept.given_back] == [grant.origin]
+        user.send_given_back()
+        user.client.keep_alive()
+        assert not user.core.kept.given_back
+        assert user.granted(user.waiter())
+
+    def test_leaves_what_a_block_uses(self, user):
+        """A far grant in use is in no table, and known all the same."""
+        user.kept()
+        lock = user.begin()
+        user.client.keep_alive()
+        assert not user.core.kept.given_back
+        lock.release()
+        user.client.keep_alive()
+        assert not user.core.kept.given_back
+
 
 class TestLeft:
     def test_of_another_epoch(self, user):

@@ -20,8 +20,10 @@ MISJUDGED = (7004196, 7005673, 9019225)
 """Seeds at which the judge was wrong: slots that only a prepared commit names were unknown to it, and
 it took a version for one that a power failure had undone, whose stamp came again."""
 
-WRONG = (1795934812665,)
-"""Seeds at which the core was wrong: it took the refusal of a second copy for the fate of the first."""
+WRONG = (1795934812665, 1795959492143)
+"""Seeds at which the core was wrong: it took the refusal of a second copy for the fate of the first;
+a far grant that its client did not know of, as the answer was lost, stayed until somebody asked.
+"""
 
 KNOWN_BAD = {
     "parks_without_a_look": 16,

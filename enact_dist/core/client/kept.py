@@ -133,15 +133,16 @@ class OwnGrants:
                 self.by_items.pop(items, None)
 
     def hear(self, shard: str, left: Iterable[GrantLeft], used: set[Token | None]) -> None:
-        """Give back the recalled far grants that no block uses, forgotten ones, too.
+        """Give back the far grants that no block uses and that are recalled, or not known here.
 
         Args:
             shard: Whose word it is.
             left: What the shard lists.
             used: The tokens there of the locks that are not at rest.
         """
-        for lock, token, _, recalled in left:
-            if not recalled:
+        known = {grant.token for grant in self.by_items.values() if grant.shard == shard} | used
+        for lock, token, _, far, recalled in left:
+            if not far or (token in known and not recalled):
                 continue
             if token in used:
                 self.recalled.add((shard, token))

@@ -280,7 +280,7 @@ class ClientSession(Generic[L]):
         believe = self.sendings.believe_until_ns
         until_ns = believe(answer.count_seen, self.ttl_ns)
         self.kept.alive(shard, left, asked=request.count, until_ns=until_ns)
-        if any(grant.recalled for grant in answer.grants):
+        if any(grant.far for grant in answer.grants):
             parts = (part for lock in self._locks.values() for part in lock.parts)
             used = {part.token for part in parts if part.shard == shard}
             self.kept.hear(shard, answer.grants, used)

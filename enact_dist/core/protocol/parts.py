@@ -196,13 +196,16 @@ class LaneView(NamedTuple):
 class GrantLeft(NamedTuple):
     """A live grant as the shard sees it.
 
-    `recalled`: another lock waits for it; once no block uses it, it is to be given back, by a
-    `Release` of `lock`.  Only said of what is kept `FAR`.
+    `far`: it is kept `FAR`.  A client that does not know of it, because the answer that said so
+    was lost, gives it back, by a `Release` of `lock`.
+    `recalled`: it is far, and another lock waits for it: it is to be given back once no block uses
+    it.
     """
 
     lock: LockId
     token: Token
     hold_left_ns: int
+    far: bool = False
     recalled: bool = False
 
 

@@ -303,6 +303,8 @@ class ClientNode(Host):
 
     def _hears(self, shard: str, question: Request, asked_ns: int, answer: Answer | None) -> None:
         """Take word of recalls, or none, as the thread of `link.client.kept` does."""
+        if shard not in self._quiet:
+            return  # its session has ended
         word = isinstance(answer, Alive) and any(grant.recalled for grant in answer.grants)
         early = self.local_ns - asked_ns < SLICE_NS // 2
         if answer is not None:
