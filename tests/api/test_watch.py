@@ -97,7 +97,7 @@ def test_watch_of_all_aspects_shows_data_without_their_types(online):
             del lock[Write(online, bench, NAME)]
         assert watch.value(replace(change, carried=None)) is None
     with online.watch(bench) as watch, pytest.raises(MisuseError, match="data=True"):
-        watch.value(watch.next(SOON_S))
+        watch.value(change)
 
 
 @pytest.mark.parametrize("gone", [False, True])
