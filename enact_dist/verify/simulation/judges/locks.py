@@ -179,7 +179,8 @@ class KeepingJudge:
     def looked(self, grant: KeptGrant, page: SimulatedPage | None) -> None:
         """A client has its mark and reads that its grant lives: the lock begins in this moment.
 
-        Without a page the grant is a far one: it lives as long as its client believes in it.
+        Without a page the grant is a far one: it lives as long as its client believes in it.  If
+        its shard has restarted, it shows what was there before, as a lock does that was held then.
         """
         number = grant.token.number
         cleared = page.cleared.get(number) if page is not None else None
@@ -187,6 +188,8 @@ class KeepingJudge:
             self._fail("R5 no use begins once its cell was cleared", grant.origin, number)
         self._observed.count("locks begun from afar", page is None)
         picture = self._observed.pictures[grant.shard]
+        if page is None and grant.token.epoch != picture.epoch:
+            return
         for state in grant.states:
             newest = picture.now(state.slot)
             if not _is(state, newest):
