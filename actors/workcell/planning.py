@@ -254,7 +254,7 @@ class Search:
     def is_news(self, found: Plan, last: Path | None) -> bool:
         """Return whether what was found replaces the last path.
 
-        A path says once that there is no way; that alone replaces no path that is still free.
+        The planner publishes once that there is no way.  That replaces no path that is still free.
         """
         if len(found.waypoints) or last is None:
             return True

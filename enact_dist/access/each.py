@@ -84,7 +84,7 @@ class WritableEach(EachData[T], MutableMapping[Entity, T]):
         return super().__getitem__(entity)
 
     def stamp_ns(self, entity: Entity) -> int:
-        """Return when an entity's datum was captured, or is said to be by this lock."""
+        """Return when an entity's datum was captured, or what this lock says of it."""
         written = self._block.writing.data.get(self._slots[entity])
         return super().stamp_ns(entity) if written is None else written.stamp_ns
 

@@ -213,6 +213,11 @@ class Session:
         self.greet(enough=enough)
         return self.client.aspect_entries()
 
+    def typed_aspects(self, *, enough: str = "") -> list[str]:
+        """Return the names of the registered aspects that have a type, sorted; see `registered`."""
+        entries = self.registered(enough=enough)
+        return sorted(name for name, entry in entries.items() if entry.fingerprint)
+
     def look_up(self, aspects: Iterable[Aspect[Any]], *, timeout_s: float | None = None) -> None:
         """Make sure that no shard knows one of these aspects, which are only read, otherwise.
 

@@ -279,8 +279,7 @@ def _item(cell: Cell, request: tuple[str, str, str, str], default: str | None) -
             f"in which world context is {entity}/{aspect}? write WORLD:{entity}/{aspect}:{access}"
             f" or --world WORLD (known: {', '.join(worlds) or 'none'})"
         )
-    entries = session_behind(cell).registered(enough=aspect)
-    known = [name for name, entry in entries.items() if entry.fingerprint]
+    known = session_behind(cell).typed_aspects(enough=aspect)
     if aspect not in known:
         raise unknown_aspect(aspect, known)
     cell.world(world)  # refuses an unknown one by name

@@ -96,9 +96,9 @@ class ShardHost:
         shard: The shard; only the host calls it from now on.
         store: Where its records go; None: they last only as long as this process.
         clock: Read under the mutex, so the shard's time never goes back.
-        on_failure: Called once, from any thread, when the store or the core has failed.
+        on_failure: Called once, from any thread, when store or core failed; the host is dead then.
         shared: Folder of large data that clients of this host map; None: they stay in memory.
-        payload_bytes_max: Byte limit of that folder; None: half of the file system.
+        payload_bytes_max: Byte limit of that folder; None: half of the file system, memory beyond.
     """
 
     def __init__(

@@ -295,10 +295,10 @@ def _value_of(context: WorldContext, aspects: Mapping[str, Aspect[Any]], change:
     aspect, session = aspects.get(change.aspect), context.session
     if change.carried is not None:
         datum = at_hand(session.client, session.cache, change.carried)
-        if datum is not None and aspect is not None:
-            return decode_datum(datum, aspect.datum_type)
         if datum is not None:
-            return decode_untyped(datum)
+            return (
+                decode_untyped(datum) if aspect is None else decode_datum(datum, aspect.datum_type)
+            )
     try:
         if aspect is None:
             return untyped_datum(context, session, change.entity, change.aspect)

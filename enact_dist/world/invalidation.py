@@ -142,17 +142,17 @@ def _shown(session: Session, made: dict[DatumRead, EffectTree]) -> dict[Slot, Da
     aspects = client.aspect_entries()
     newest = explained(client, [SlotVersion(slot, 0) for slot in slots])
     states = (entry.state for answer in newest for entry in answer.entries)
+    outcome = fingerprint(Outcome)
     return {
         state.slot: DatumRead(*state[:3])
         for state in states
         if DatumRead(*state[:3]) in made and not state.null_reason
-        if not _is_outcome(aspects[state.slot.aspect].fingerprint)
+        if not _is_of_type(aspects[state.slot.aspect].fingerprint, outcome)
     }
 
 
-def _is_outcome(datum_type: str) -> bool:
-    """Whether data of this type are outcomes; a later release may have added fields to it."""
-    own = fingerprint(Outcome)
+def _is_of_type(datum_type: str, own: str) -> bool:
+    """Whether a type is one of ours; a later release may have added fields to it."""
     return same_type(datum_type, own) or succeeds(datum_type, own)
 
 

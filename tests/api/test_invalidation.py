@@ -180,7 +180,7 @@ def test_an_outcome_stays_and_what_was_made_of_it_does_not(cell, world, chain):
 
 
 def test_a_datum_whose_type_begins_as_an_outcome_does_becomes_null(cell, world, chain):
-    """A program may have a class of that name; it says nothing of what an actor has done."""
+    """A user's own class of that name is data like any other."""
     fields = ("state", str), ("version", int), ("committed_ns", int), ("score", float)
     own = dataclasses.make_dataclass("Outcome", fields, frozen=True)
     put(world, CUP, Aspect("own_outcome", own), own("done", 1, 1, 0.5), (CUP, POSE))

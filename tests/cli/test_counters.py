@@ -128,7 +128,7 @@ def test_ls_shows_the_counters_of_its_own_connection(enact, cell_file, monkeypat
 
 
 def test_every_counter_of_a_connection_stands_in_its_table():
-    """Whoever adds one adds its line there."""
+    """A new counter needs a line there."""
     rows = [
         f"| `{name}` | {figure.meaning} | {figure.remedy or '-'} |"
         for name, figure in OF_A_CONNECTION.items()

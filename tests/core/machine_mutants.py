@@ -265,7 +265,7 @@ def revokes_what_a_block_uses(patch):
 
 
 def no_word_of_a_recall(patch):
-    """Whoever listens hears of a recall when its slice ends."""
+    """A listening session hears of a recall when its slice ends."""
     patch(SessionHandler, "tell_recalled", lambda handler: list(handler._tell(())))
 
 

@@ -5,8 +5,8 @@ for any of them, and from the second block of the same data in a row on.  Later 
 then name its token, each with a higher seq than its lane has used.  Whoever comes to wait for it
 takes it back: at once if no block uses it, else with that block.
 
-A session that listens when its grant stays shares no memory with the shard: whoever wants such a
-grant waits until it is given back, and those that listen are told.
+A session that listens when its grant stays shares no memory with the shard: another lock of
+such a grant waits until it is given back, and those that listen are told.
 """
 
 from __future__ import annotations

@@ -254,7 +254,7 @@ class TestEnds:
         assert [story.kind for story in bench.stories if story.kind == "lock.taken"] == []
 
     def test_broken_by_hand(self, bench):
-        """Whoever listens hears at once; a commit under it is refused with the cause."""
+        """A listening session hears at once; a commit under it is refused with the cause."""
         handle = bench.listen()
         kept = bench.keep()
         number = bench.ask(ListLocks()).holders[0].number

@@ -134,9 +134,8 @@ def _aspects(
     from enact_dist.world.cell import session_behind
 
     tolerances = dict(options.tolerance)
-    entries = session_behind(cell).registered()
-    registered = [name for name, entry in entries.items() if entry.fingerprint]
-    names = options.aspect or sorted(registered)
+    registered = session_behind(cell).typed_aspects()
+    names = options.aspect or registered
     unknown = [name for name in tolerances if name and name not in names]
     if unknown:
         compared = ", ".join(names) or "none"

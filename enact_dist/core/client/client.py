@@ -6,16 +6,17 @@ A lock is begun under a plan, which splits what was requested by shard.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from itertools import repeat
 from typing import Final
 
 from enact_dist.core.client.kept import Keeping, KeptGrant
 from enact_dist.core.client.lease_clock import shortened_ns
-from enact_dist.core.client.lock import MultiLock
+from enact_dist.core.client.lock import WAIT_SLICE_NS, MultiLock
 from enact_dist.core.client.plan import Phase, Plan, Reading
 from enact_dist.core.client.session import ClientSession
 from enact_dist.core.protocol.datum import LockId
-from enact_dist.core.protocol.messages import Item, PlacementMap
+from enact_dist.core.protocol.messages import Alive, Answer, Item, PlacementMap, Request
 from enact_dist.core.protocol.placement import shard_of
 from enact_dist.core.state.tenure import is_keepable
 from enact_dist.terms import ACCESSES, Access
@@ -23,6 +24,8 @@ from enact_dist.terms import ACCESSES, Access
 PLANNED_MAX: Final = 32
 PLANS_MAX: Final = 256
 """Sets of so few requested items, at most so many, whose split by shard is remembered."""
+QUIET_MAX: Final = 3
+"""A session listens no more after so many answers in a row while it keeps no grant of the shard."""
 
 
 class Client(ClientSession[MultiLock]):
@@ -153,3 +156,44 @@ class Client(ClientSession[MultiLock]):
             assert lock.lock == lock_id
             assert lock.phase.busy or lock.phase is Phase.HELD, lock.phase
             assert lock_id.seq <= self._seqs[lock_id.lane]
+
+
+@dataclass(slots=True, eq=False)
+class RecallListener:
+    """Listens for recalls of one shard while its session keeps far grants there.
+
+    Who drives it sends what `ask` returns, and gives `hear` the answer, until it is `over`.
+
+    Attributes:
+        word: Whether the last answer told of a recall.
+    """
+
+    client: Client
+    shard: str
+    word: bool = False
+    _asked_ns: int = 0
+    _quiet: int = 0
+
+    @property
+    def over(self) -> bool:
+        """Whether the session has kept no grant of the shard for some answers in a row."""
+        return self._quiet >= QUIET_MAX
+
+    def ask(self, now_ns: int) -> Request:
+        """Return the next question, which the shard keeps until a recall, or for a slice."""
+        self._asked_ns = now_ns
+        return self.client.keep_alive(self.shard, now_ns, wait_ns=WAIT_SLICE_NS)
+
+    def hear(self, question: Request, answer: Answer | None, now_ns: int) -> bool:
+        """Take the answer, None if there is none; return whether to pause before the next question.
+
+        One that came early without word of a recall would else be followed at once by the next.
+        """
+        self.word = isinstance(answer, Alive) and any(grant.recalled for grant in answer.grants)
+        early = now_ns - self._asked_ns < WAIT_SLICE_NS // 2
+        if answer is not None:
+            self.client.answered(self.shard, question, answer, now_ns)
+        if not self.word and not early:
+            self.client.kept.rest(self.shard)
+        self._quiet = 0 if self.client.far(self.shard) else self._quiet + 1
+        return early and not self.word

@@ -140,16 +140,15 @@ class OwnGrants:
             left: What the shard lists.
             used: The tokens there of the locks that are not at rest.
         """
-        known = {grant.token for grant in self.by_items.values() if grant.shard == shard} | used
+        idle = {g.token: items for items, g in self.by_items.items() if g.shard == shard}
         for lock, token, _, far, recalled in left:
-            if not far or (token in known and not recalled):
+            if not far or (not recalled and (token in idle or token in used)):
                 continue
             if token in used:
                 self.recalled.add((shard, token))
                 continue
-            for items, grant in list(self.by_items.items()):
-                if (grant.shard, grant.token) == (shard, token):
-                    self.by_items.pop(items, None)
+            if token in idle:
+                del self.by_items[idle[token]]
             self.given_back.append((shard, Release(lock)))
 
     def heard(self, shard: str) -> tuple[int, ...]:

@@ -241,8 +241,8 @@ class SessionHandler:
                 tenure.lock,
                 tenure.token,
                 max(0, tenure.hold_end_ns - state.now_ns),
-                tenure.kept == FAR,
-                tenure.kept == FAR and tenure.recalled,
+                far := tenure.kept == FAR,
+                far and tenure.recalled,
             )
             for tenure in state.tenures.of_session(session.session)
             if tenure.token is not None

@@ -20,7 +20,9 @@ import logging
 import threading
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from enact_dist.core.protocol.messages import PROVE, Alive, DatumRead, Item, Release
+from enact_dist.core.client.client import RecallListener
+from enact_dist.core.client.lock import WAIT_SLICE_NS
+from enact_dist.core.protocol.messages import PROVE, DatumRead, Item, Release
 from enact_dist.errors import EnactError
 from enact_dist.link.client.calls import CALL_S
 from enact_dist.link.memory.use_marks import retains
@@ -36,10 +38,8 @@ if TYPE_CHECKING:
     from enact_dist.link.client.pauses import Pauses
     from enact_dist.link.memory.payload_client import SharedPayloads
 
-SLICE_NS: Final = 900_000_000
-"""How long a shard keeps one question for recalls; below its own limit of 1 s."""
-QUIET_MAX: Final = 3
-"""A thread ends after so many answers in a row while its session keeps no grant of the shard."""
+LISTEN_S: Final = WAIT_SLICE_NS / 1e9 + CALL_S
+"""How long a question for recalls waits for its answer."""
 QUIET_S: Final = 0.1
 """Pause after a question that came back early without word of a recall, or could not be asked."""
 
@@ -198,27 +198,20 @@ class KeptUses:
         self, shard: str, carrier: Carrier, pauses: Pauses, session: weakref.ref[object]
     ) -> None:
         """Ask a shard for recalls while this session keeps grants there."""
-        quiet = 0
-        while quiet < QUIET_MAX and session() is not None and not pauses.over:
+        listener = RecallListener(self._core, shard)
+        while not listener.over and session() is not None and not pauses.over:
             with self._mutex:
-                asked_ns, answer = self._now_ns(), None
-                greets = self._core.needs_hello(shard)
-                question = self._core.keep_alive(shard, asked_ns, wait_ns=SLICE_NS)
+                greets, answer = self._core.needs_hello(shard), None
+                question = listener.ask(self._now_ns())
             try:
                 if not greets:  # the keep-alive thread greets, and learns what the shard has
-                    answer = carrier.request(shard, question, timeout_s=SLICE_NS / 1e9 + CALL_S)
+                    answer = carrier.request(shard, question, timeout_s=LISTEN_S)
             except EnactError as error:
                 _log.info("no word of recalls from shard %s: %s", shard, error)
-            word = isinstance(answer, Alive) and any(grant.recalled for grant in answer.grants)
-            early = self._now_ns() - asked_ns < SLICE_NS // 2
             with self._mutex:
-                if answer is not None:
-                    self._core.answered(shard, question, answer, self._now_ns())
-                if not word and not early:
-                    self._core.kept.rest(shard)
-                quiet = 0 if self._core.far(shard) else quiet + 1
+                pauses_first = listener.hear(question, answer, self._now_ns())
             self.give_back()
-            if early and not word:
+            if pauses_first:
                 pauses.rest(QUIET_S)
 
     def join(self) -> None:

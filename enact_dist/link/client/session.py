@@ -484,7 +484,7 @@ class SessionClient:
         self._kept.repair()
 
     def set_report(self, report: bytes) -> None:
-        """Set what the next keep-alives carry: an actor's statistics, msgpack of a map."""
+        """Set what the next keep-alives carry: an actor's statistics; MisuseError if too long."""
         if (size := len(report)) > REPORT_BYTES_MAX:
             raise MisuseError(f"a report of {size} bytes; at most {REPORT_BYTES_MAX} are kept")
         if self.forked or self.closed:

@@ -329,7 +329,7 @@ class Page:
         self._learned = None
 
     def _ask_for_history(self) -> None:
-        """Ask for the chosen datum's beside the page, one at a time: a recording is read through.
+        """Ask for that of the chosen datum beside the page, one at a time: a cell may be slow.
 
         It waits for the datum's size, and until the datum itself is shown.
         """

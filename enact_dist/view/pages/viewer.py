@@ -149,8 +149,7 @@ class Viewer(Closing):
         cell = self.cell.cell
         first, second = (cell.world(side.world).at(_moment(side.at_ns)) for side in (left, right))
         compared = {aspect.name: aspect for aspect in self._settings.aspects()}
-        entries = self.cell.session.registered()
-        names = sorted(name for name, entry in entries.items() if entry.fingerprint)
+        names = self.cell.session.typed_aspects()
         return first.diff(second, "**", *(compared.get(name, name) for name in names))
 
     def pin(self, label: str, versions: list[Made]) -> None:

@@ -194,7 +194,7 @@ def test_an_arm_that_did_not_come_aside_is_asked_about(cell):
 
 
 def test_an_answer_that_was_typed_is_given_until_it_stands(cell, monkeypatch):
-    """Its commit fails: nobody has to type it again, and nothing is removed twice."""
+    """A failed commit loses no typed answer, and the robot removes nothing twice."""
     removed = []
     hands = SimpleNamespace(remove=removed.append)
     monkeypatch.setattr("actors.palletizing.operator.open_controller", lambda _: hands)

@@ -12,11 +12,10 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
-from enact_dist.core.client.client import Client
+from enact_dist.core.client.client import Client, RecallListener
 from enact_dist.core.client.plan import Phase
 from enact_dist.core.protocol.messages import (
     Acquire,
-    Alive,
     Answer,
     AspectEntry,
     Hello,
@@ -28,7 +27,7 @@ from enact_dist.core.protocol.messages import (
     Welcome,
 )
 from enact_dist.link.client.catalogue import CATALOGUES, KnownCatalogue
-from enact_dist.link.client.kept import QUIET_MAX, QUIET_S, SLICE_NS
+from enact_dist.link.client.kept import QUIET_S
 from enact_dist.verify.simulation.hosts.folders import ClientFiles, Folders
 from enact_dist.verify.simulation.hosts.keeping import KeptLocks, Sight, Stop
 from enact_dist.verify.simulation.hosts.world import MS, Host, S
@@ -116,7 +115,7 @@ class ClientNode(Host):
         self._late_answers = world.schedule.place(f"{name}-late")
         self._stopped: dict[int, Thread] = {}
         self._stops = 0
-        self._quiet: dict[str, int] = {}
+        self._listeners: dict[str, RecallListener] = {}
         self.kept = KeptLocks(
             self.client,
             sight,
@@ -288,8 +287,8 @@ class ClientNode(Host):
 
     def listen(self, shard: str) -> None:
         """Listen for recalls of a shard, unless this client does so already."""
-        if shard not in self._quiet:
-            self._quiet[shard] = 0
+        if shard not in self._listeners:
+            self._listeners[shard] = RecallListener(self.client, shard)
             self._ask_for_recalls(shard)
 
     def _ask_for_recalls(self, shard: str) -> None:
@@ -297,26 +296,22 @@ class ClientNode(Host):
         if starves or self.client.needs_hello(shard):
             self.later(QUIET_NS, lambda: self._ask_for_recalls(shard))
             return
-        asked_ns = self.local_ns
-        question = self.client.keep_alive(shard, asked_ns, wait_ns=SLICE_NS)
-        self.call(shard, question, partial(self._hears, shard, question, asked_ns))
+        listener = self._listeners.get(shard)
+        if listener is not None:
+            question = listener.ask(self.local_ns)
+            self.call(shard, question, partial(self._hears, listener, question))
 
-    def _hears(self, shard: str, question: Request, asked_ns: int, answer: Answer | None) -> None:
+    def _hears(self, listener: RecallListener, question: Request, answer: Answer | None) -> None:
         """Take word of recalls, or none, as the thread of `link.client.kept` does."""
-        if shard not in self._quiet:
+        shard = listener.shard
+        if shard not in self._listeners:
             return  # its session has ended
-        word = isinstance(answer, Alive) and any(grant.recalled for grant in answer.grants)
-        early = self.local_ns - asked_ns < SLICE_NS // 2
-        if answer is not None:
-            self.client.answered(shard, question, answer, self.local_ns)
-        if not word and not early:
-            self.client.kept.rest(shard)
-        self.world.tally["words of a recall"] += word
-        self._quiet[shard] = 0 if self.client.far(shard) else self._quiet[shard] + 1
+        pauses_first = listener.hear(question, answer, self.local_ns)
+        self.world.tally["words of a recall"] += listener.word
         self.kept.give_back()
-        if self._quiet[shard] >= QUIET_MAX:
-            del self._quiet[shard]
-        elif early and not word:
+        if listener.over:
+            del self._listeners[shard]
+        elif pauses_first:
             self.later(QUIET_NS, lambda: self._ask_for_recalls(shard))
         else:
             self._ask_for_recalls(shard)
@@ -358,7 +353,7 @@ class ClientNode(Host):
         self.end_life()
         self._calls.clear()
         self._stopped.clear()
-        self._quiet.clear()
+        self._listeners.clear()
         self.kept.vanish()
         self.files.vanish()
         self.threads_left = 0
