@@ -20,9 +20,10 @@ MISJUDGED = (7004196, 7005673, 9019225)
 """Seeds at which the judge was wrong: slots that only a prepared commit names were unknown to it, and
 it took a version for one that a power failure had undone, whose stamp came again."""
 
-WRONG = (1795934812665, 1795959492143)
+WRONG = (1795934812665, 1795959492143, 1795962997662)
 """Seeds at which the core was wrong: it took the refusal of a second copy for the fate of the first;
-a far grant that its client did not know of, as the answer was lost, stayed until somebody asked.
+a far grant that its client did not know of, as the answer was lost, stayed until somebody asked; so
+did one whose answer came after the client had stopped listening.
 """
 
 KNOWN_BAD = {

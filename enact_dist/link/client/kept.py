@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from enact_dist.core.client.client import RecallListener
 from enact_dist.core.client.lock import WAIT_SLICE_NS
-from enact_dist.core.protocol.messages import PROVE, DatumRead, Item, Release
+from enact_dist.core.protocol.messages import FAR, PROVE, DatumRead, Item, Release
 from enact_dist.errors import EnactError
 from enact_dist.link.client.calls import CALL_S
 from enact_dist.link.memory.use_marks import retains
@@ -162,6 +162,8 @@ class KeptUses:
                 self._payloads.prove(part.shard)
             else:
                 self._start_listening(part.shard)
+        elif keeping.said == FAR:  # its answer may have been late: the thread may have ended
+            self._start_listening(part.shard)
         elif page is not None and grant is not None:
             if page.lives(grant.place, number):
                 self._core.kept.put_back(grant)

@@ -16,7 +16,7 @@ from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
 
-from enact_dist.core.protocol.messages import PROVE, Release
+from enact_dist.core.protocol.messages import FAR, PROVE, Release
 from enact_dist.core.state.tenure import KEPT_OF_SESSION_MAX
 from enact_dist.link.memory.use_marks import PAGE_BYTES, PROOF, ShardMarks, ShardPage
 from enact_dist.verify.simulation.hosts.world import MS
@@ -320,7 +320,7 @@ class KeptLocks:
             yield self._stop(part.shard)
             page.unmark(number)
             keeping.begun_ns = 0
-        if keeping.said == PROVE and self._sight is Sight.FAR:
+        if keeping.said in (PROVE, FAR) and self._sight is Sight.FAR:
             self.listens(part.shard)
         elif keeping.said == PROVE:
             self._prove(part.shard)
