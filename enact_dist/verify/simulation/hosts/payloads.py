@@ -114,7 +114,8 @@ class ShardPayloads:
             again = known is not None and known() is memory
             self._world.tally["payloads adopted again" if again else "payloads adopted"] += 1
             self._adopted[before.datum.file] = weakref.ref(memory)
-            self._check_written(before.datum.file, after.datum)
+            if message.token.epoch == self._shard.epoch:  # else it is refused, whatever it names
+                self._check_written(before.datum.file, after.datum)
             _, begun_ns, _ = self._drafts.pop(before.datum.file, ("", self._host.local_ns, 0))
             late = self._host.local_ns - begun_ns > DRAFT_NS
             self._world.tally["payloads adopted after a long time"] += late
